@@ -1,0 +1,1 @@
+"""Byte pipes: serial, UDP, in memory."""

@@ -1,0 +1,31 @@
+"""From the URL of a link in the configuration to the opener of its transport."""
+
+from arm_companion.errors import ConfigError
+from arm_companion.transport.base import Opener
+from arm_companion.transport.serial import open_serial
+from arm_companion.transport.udp import udp_in, udp_out
+
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, serial:DEVICE:BAUD"
+
+
+def open_url(url: str) -> Opener:
+    """The opener that `url` names. IPv6 hosts stand in brackets.
+
+    Raises:
+        ConfigError: with the URL and the allowed forms.
+    """
+    scheme, _, rest = url.partition(":")
+    place, separator, number = rest.rpartition(":")
+    if not separator or not place or not number.isascii() or not number.isdigit():
+        raise ConfigError(f"link url {url!r} is not one of {FORMS}")
+    value = int(number)
+    if scheme == "serial":
+        if not 1200 <= value <= 12_000_000:
+            raise ConfigError(f"link url {url!r}: baud {value} is outside 1200 to 12000000")
+        return open_serial(place, value)
+    if scheme not in ("udpin", "udpout"):
+        raise ConfigError(f"link url {url!r} is not one of {FORMS}")
+    if not 1 <= value <= 65_535:
+        raise ConfigError(f"link url {url!r}: port {value} is outside 1 to 65535")
+    host = place.removeprefix("[").removesuffix("]")
+    return udp_in(host, value) if scheme == "udpin" else udp_out(host, value)

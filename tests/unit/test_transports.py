@@ -1,0 +1,245 @@
+"""Transports: UDP sockets on the loopback, the memory pipe, and the URLs that name them."""
+
+import asyncio
+import socket
+from collections.abc import Callable, Coroutine
+from typing import Any
+
+import pytest
+
+from arm_companion.clock import run_simulated
+from arm_companion.errors import ConfigError, LinkError
+from arm_companion.transport.memory import MemoryPipe
+from arm_companion.transport.udp import UdpTransport, udp_in, udp_out
+from arm_companion.transport.urls import open_url
+
+HOST = "127.0.0.1"
+
+
+async def until(condition: Callable[[], object]) -> None:
+    """Wait for what the kernel will do in a moment."""
+    async with asyncio.timeout(2.0):
+        while not condition():  # noqa: ASYNC110 - the kernel sets no event
+            await asyncio.sleep(0.001)
+
+
+def run(main: Coroutine[Any, Any, None]) -> None:
+    asyncio.run(main)
+
+
+async def waiting(received: list[bytes]) -> tuple[UdpTransport, int]:
+    pipe = await udp_in(HOST, 0)(received.append)
+    assert isinstance(pipe, UdpTransport)
+    return pipe, pipe.local[1]
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((HOST, 0))
+        return int(probe.getsockname()[1])
+
+
+# --- UDP ---
+
+
+def test_datagrams_pass_both_ways() -> None:
+    async def main() -> None:
+        heard: list[bytes] = []
+        answers: list[bytes] = []
+        pipe, port = await waiting(heard)
+        caller = await udp_out(HOST, port)(answers.append)
+        caller.write(b"question")
+        await until(lambda: heard)
+        pipe.write(b"answer")
+        await until(lambda: answers)
+        assert (heard, answers) == ([b"question"], [b"answer"])
+        caller.close()
+        pipe.close()
+        await asyncio.gather(caller.wait_closed(), pipe.wait_closed())
+
+    run(main())
+
+
+def test_a_waiting_socket_answers_whoever_spoke_last() -> None:
+    async def main() -> None:
+        heard: list[bytes] = []
+        first: list[bytes] = []
+        second: list[bytes] = []
+        pipe, port = await waiting(heard)
+        pipe.write(b"nobody is there")
+        assert pipe.dropped == 1
+        one = await udp_out(HOST, port)(first.append)
+        two = await udp_out(HOST, port)(second.append)
+        for caller, answers in ((one, first), (two, second), (one, first)):
+            heard.clear()
+            answers.clear()
+            caller.write(b"?")
+            await until(lambda: heard)
+            pipe.write(b"!")
+            await until(lambda answers=answers: answers)
+        assert second == [b"!"]
+        for transport in (one, two, pipe):
+            transport.close()
+            await transport.wait_closed()
+
+    run(main())
+
+
+def test_a_calling_socket_hears_only_whom_it_calls() -> None:
+    async def main() -> None:
+        heard: list[bytes] = []
+        pipe, port = await waiting([])
+        caller = await udp_out(HOST, port)(heard.append)
+        stranger, _ = await waiting([])
+        stranger.peer = caller.local
+        stranger.write(b"lies")
+        caller.write(b"hello")
+        await until(lambda: pipe.peer)
+        pipe.write(b"truth")
+        await until(lambda: heard)
+        assert heard == [b"truth"]
+        for transport in (caller, stranger, pipe):
+            transport.close()
+            await transport.wait_closed()
+
+    run(main())
+
+
+def test_a_refusal_is_survived_and_the_peer_may_come_later() -> None:
+    async def main() -> None:
+        port = free_port()
+        caller = await udp_out(HOST, port)(lambda _: None)
+        assert isinstance(caller, UdpTransport)
+        for _ in range(4):
+            caller.write(b"anybody?")
+            await asyncio.sleep(0.005)
+        assert caller.refused > 0
+        heard: list[bytes] = []
+        pipe = await udp_in(HOST, port)(heard.append)
+        caller.write(b"now?")
+        caller.write(b"now?")  # the kernel may spend one write on telling of the last refusal
+        await until(lambda: heard)
+        caller.close()
+        pipe.close()
+        await asyncio.gather(caller.wait_closed(), pipe.wait_closed())
+
+    run(main())
+
+
+def test_a_closed_socket_stays_closed() -> None:
+    async def main() -> None:
+        pipe, port = await waiting([])
+        gone = asyncio.create_task(pipe.wait_closed())
+        await asyncio.sleep(0)
+        assert not gone.done()
+        pipe.close()
+        pipe.close()
+        await asyncio.wait_for(gone, 1.0)
+        pipe.write(b"too late")
+        again = await udp_in(HOST, port)(lambda _: None)
+        again.close()
+        await again.wait_closed()
+
+    run(main())
+
+
+def test_a_port_that_is_taken_is_a_link_error() -> None:
+    async def main() -> None:
+        pipe, port = await waiting([])
+        with pytest.raises(LinkError, match=f"cannot listen on udp {HOST}:{port}"):
+            await udp_in(HOST, port)(lambda _: None)
+        pipe.close()
+        await pipe.wait_closed()
+
+    run(main())
+
+
+def test_a_name_that_does_not_resolve_is_a_link_error() -> None:
+    async def main() -> None:
+        with pytest.raises(LinkError, match="cannot reach udp"):
+            await udp_out("no-such-host.invalid", 14550)(lambda _: None)
+
+    run(main())
+
+
+def test_what_the_kernel_cannot_take_is_dropped_and_counted() -> None:
+    async def main() -> None:
+        pipe, port = await waiting([])
+        caller = await udp_out(HOST, port)(lambda _: None)
+        assert isinstance(caller, UdpTransport)
+        caller.pause_writing()  # as asyncio tells when too much waits
+        caller.write(b"1")
+        assert caller.dropped == 1
+        caller.resume_writing()
+        caller.write(b"2")
+        assert caller.dropped == 1
+        caller.close()
+        pipe.close()
+        await asyncio.gather(caller.wait_closed(), pipe.wait_closed())
+
+    run(main())
+
+
+# --- memory ---
+
+
+def test_a_memory_pipe_keeps_the_order_of_what_is_written_at_one_instant() -> None:
+    async def main() -> None:
+        heard: list[bytes] = []
+        pipe = MemoryPipe()
+        here = await pipe.opener(0)(lambda _: None)
+        there = await pipe.opener(1)(heard.append)
+        sent = [bytes([i]) for i in range(100)]
+        for chunk in sent:
+            here.write(chunk)
+        await asyncio.sleep(0.01)
+        assert heard == sent
+        here.close()
+        there.close()
+
+    run_simulated(main())
+
+
+# --- URLs ---
+
+
+@pytest.mark.parametrize(
+    "url", ["udpin:127.0.0.1:14540", "udpout:example.org:14550", "udpout:[::1]:14550", "serial:/dev/ttyAMA0:921600"]
+)
+def test_good_urls_name_an_opener(url: str) -> None:
+    assert callable(open_url(url))
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("", "is not one of udpin:HOST:PORT"),
+        ("udpin", "is not one of"),
+        ("udpin:127.0.0.1", "is not one of"),
+        ("udpin::14540", "is not one of"),
+        ("udpin:127.0.0.1:port", "is not one of"),
+        ("udpin:127.0.0.1:²", "is not one of"),
+        ("udpin:127.0.0.1:-1", "is not one of"),
+        ("udpin:127.0.0.1:0", "port 0 is outside 1 to 65535"),
+        ("udpout:127.0.0.1:65536", "port 65536 is outside"),
+        ("serial:/dev/ttyAMA0:300", "baud 300 is outside"),
+        ("tcp:127.0.0.1:5760", "is not one of"),
+    ],
+)
+def test_bad_urls_are_refused_with_the_forms_that_are_allowed(url: str, reason: str) -> None:
+    with pytest.raises(ConfigError, match="link url") as refusal:
+        open_url(url)
+    assert reason in str(refusal.value)
+    assert repr(url) in str(refusal.value)
+
+
+def test_a_url_opens_what_it_names() -> None:
+    async def main() -> None:
+        port = free_port()
+        pipe = await open_url(f"udpin:{HOST}:{port}")(lambda _: None)
+        assert isinstance(pipe, UdpTransport)
+        assert pipe.local == (HOST, port)
+        pipe.close()
+        await pipe.wait_closed()
+
+    run(main())
