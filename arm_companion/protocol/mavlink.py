@@ -1,0 +1,297 @@
+"""MAVLink codec without I/O: bytes in, messages out, and back.
+
+A companion hears far more than it needs. So the reader walks from header to header, checks each frame's
+checksum (cheap) and builds messages only for the ids that are wanted (dear). What fails the checksum is taken
+for noise: one byte is skipped and the search for the next frame goes on, so that no real frame is lost behind a
+false start.
+"""
+
+import re
+import struct
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, TypeAlias
+
+from arm_companion.errors import ProtocolError
+from arm_companion.protocol.dialect import mav
+
+Message: TypeAlias = Any
+"""A message of the generated dialect, `mav.MAVLink_<name>_message`."""
+
+MAGIC_V1: Final = 0xFE
+MAGIC_V2: Final = 0xFD
+MAGICS: Final = frozenset({MAGIC_V1, MAGIC_V2})
+SIGNED: Final = 0x01
+SIGNATURE_LENGTH: Final = 13
+
+_CRC_INIT: Final = 0xFFFF
+_ANY_MAGIC: Final = re.compile(b"[\xfd\xfe]")
+_HEADER_V2: Final = struct.Struct("<xBBxBBBHB")  # length, flags, sequence, system, component, id (low, high)
+_HEADER_V1: Final = struct.Struct("<xBBBBB")  # length, sequence, system, component, id
+
+
+def _slow_crc(data: bytes, crc: int) -> int:
+    """CRC-16/MCRF4XX in plain Python, where the compiled one is missing."""
+    for byte in data:
+        x = byte ^ (crc & 0xFF)
+        x = (x ^ (x << 4)) & 0xFF
+        crc = (crc >> 8) ^ (x << 8) ^ (x << 3) ^ (x >> 4)
+    return crc
+
+
+_compiled_crc: Callable[[bytes, int], int] | None = getattr(mav, "mcrf4xx", None)
+_crc = _slow_crc if _compiled_crc is None else _compiled_crc
+
+
+@dataclass(slots=True)
+class Counters:
+    """What a reader has seen. All count from the start of the link."""
+
+    frames: int = 0  # good frames, wanted or not
+    decoded: int = 0  # messages handed out
+    bad_crc: int = 0  # candidates whose checksum was wrong
+    bad_frame: int = 0  # right checksum, but flags or content that cannot be read
+    unknown: int = 0  # frames with ids that the dialect lacks
+    garbage: int = 0  # bytes outside of any frame
+    lost: int = 0  # frames missing from the senders' sequences
+    sent: int = 0  # frames encoded
+
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """How to read one message: precomputed from the generated class."""
+
+    make: Callable[..., Message]
+    extra: bytes  # CRC_EXTRA
+    size: int  # bytes of the whole payload
+    unpack: Callable[[bytes], tuple[Any, ...]]
+    slots: tuple[tuple[int, int], ...]  # per constructor argument: index in the unpacked tuple, entries (0: scalar)
+
+
+def _layout(cls: Any) -> _Layout:
+    starts: list[int] = []
+    at = 0
+    for length in cls.lengths:  # unpacked entries of each field, in wire order
+        starts.append(at)
+        at += length
+    slots = tuple((starts[order], cls.array_lengths[order] if cls.lengths[order] > 1 else 0) for order in cls.orders)
+    return _Layout(cls, bytes([cls.crc_extra]), cls.unpacker.size, cls.unpacker.unpack, slots)
+
+
+_LAYOUTS: Final[dict[int, _Layout]] = {id_: _layout(cls) for id_, cls in mav.mavlink_map.items()}
+
+
+@dataclass(slots=True)
+class _NoSigning:
+    """Stands where the generated code looks for the signing state of the sender."""
+
+    sign_outgoing: bool = False
+
+
+@dataclass(slots=True)
+class _Sender:
+    """What the generated `pack` needs to know of the sender."""
+
+    srcSystem: int
+    srcComponent: int
+    seq: int = 0
+    signing: _NoSigning = field(default_factory=_NoSigning)
+
+
+class MavlinkCodec:
+    """Reader and writer of one link.
+
+    Args:
+        system_id: our system id in what we send; may be changed later.
+        component_id: our component id.
+        wanted: ids of messages to decode; None decodes every known one.
+    """
+
+    def __init__(self, system_id: int, component_id: int, wanted: Collection[int] | None = None) -> None:
+        self.counters = Counters()
+        self.wanted: frozenset[int] | None = None if wanted is None else frozenset(wanted)
+        self._sender = _Sender(system_id, component_id)
+        self._rest = b""
+        self._sequences: dict[int, int] = {}
+
+    @property
+    def system_id(self) -> int:
+        """System id in what we send."""
+        return self._sender.srcSystem
+
+    @system_id.setter
+    def system_id(self, value: int) -> None:
+        self._sender.srcSystem = value
+
+    @property
+    def component_id(self) -> int:
+        """Component id in what we send."""
+        return self._sender.srcComponent
+
+    def encode(self, message: Message) -> bytes:
+        """One MAVLink 2 frame with the next sequence number.
+
+        Raises:
+            ProtocolError: when a field does not fit its type; nothing is counted as sent then.
+        """
+        try:
+            data: bytes = message.pack(self._sender)
+        except (struct.error, TypeError, ValueError, OverflowError) as error:
+            raise ProtocolError(f"{message.get_type()} cannot be encoded: {error}") from error
+        self._sender.seq = (self._sender.seq + 1) & 0xFF
+        self.counters.sent += 1
+        return data
+
+    @property
+    def pending(self) -> bool:
+        """Whether half a frame waits for the rest of its bytes."""
+        return bool(self._rest)
+
+    def reset(self) -> None:
+        """Forget half a frame, as after a reconnect."""
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[Message]:
+        """Take received bytes, in any cut.
+
+        Returns:
+            The wanted messages that are complete now, in order. Never raises for anything received.
+        """
+        return self._scan(self._rest + data if self._rest else data, final=False)
+
+    def flush(self) -> list[Message]:
+        """The line has been silent for long: give up on half a frame, and read what hides behind it.
+
+        A noise byte that looks like the start of a long frame would otherwise hold back a real one.
+        """
+        return self._scan(self._rest, final=True)
+
+    def _scan(self, data: bytes, *, final: bool) -> list[Message]:
+        messages: list[Message] = []
+        counters, size, at = self.counters, len(data), 0
+        self._rest = b""
+        while at < size:
+            if (start := _next_magic(data, at)) > at:
+                counters.garbage += start - at
+                at = start
+                continue
+            end = _frame_end(data, at)
+            if end <= size:
+                head = _header(data, at)
+                if self._genuine(data, end, head):
+                    at = end
+                    if (self.wanted is None or head.id in self.wanted) and head.id in _LAYOUTS:
+                        messages += self._build(data, end, head)
+                    continue
+            elif not final:
+                self._rest = data[at:]
+                break
+            counters.garbage += 1
+            at += 1
+        return messages
+
+    def _genuine(self, data: bytes, end: int, head: "_Header") -> bool:
+        """Whether the candidate with this header, which ends before `end`, is a frame and not noise."""
+        counters = self.counters
+        if head.flags & ~SIGNED:  # the standard: drop frames with flags that we do not understand
+            counters.bad_frame += 1
+            return False
+        layout = _LAYOUTS.get(head.id)
+        if layout is None:
+            # Without CRC_EXTRA there is no check but what follows (the next frame, or nothing yet), and that
+            # it is not noise in front of a real frame.
+            if (end < len(data) and data[end] not in MAGICS) or _hides_frame(data[head.magic + 1 : end]):
+                return False
+            counters.unknown += 1
+            return True
+        if not _checksum_fits(data, head, layout):
+            counters.bad_crc += 1
+            return False
+        counters.frames += 1
+        self._count_losses(head.system << 8 | head.component, head.sequence)
+        return True
+
+    def _build(self, data: bytes, end: int, head: "_Header") -> list[Message]:
+        """The message in a genuine frame; none, and counted, when its content cannot be read."""
+        try:
+            message = _decode(_LAYOUTS[head.id], data[head.payload : head.crc])
+        except (TypeError, ValueError, struct.error):
+            self.counters.bad_frame += 1
+            return []
+        self.counters.decoded += 1
+        # The generated decoder fills the same private fields.
+        message._header = mav.MAVLink_header(  # noqa: SLF001
+            head.id, head.flags, 0, head.crc - head.payload, head.sequence, head.system, head.component
+        )
+        message._msgbuf = data[head.magic : end]  # noqa: SLF001
+        return [message]
+
+    def _count_losses(self, sender: int, sequence: int) -> None:
+        last = self._sequences.get(sender)
+        if last is not None:
+            gap = (sequence - last - 1) & 0xFF
+            if gap >= 0x80:  # an old frame that came late, or the same one twice
+                return
+            self.counters.lost += gap
+        self._sequences[sender] = sequence
+
+
+def _next_magic(data: bytes, at: int) -> int:
+    """Where the next frame may start; the end of the data when nowhere."""
+    if data[at] in MAGICS:
+        return at
+    found = _ANY_MAGIC.search(data, at)
+    return len(data) if found is None else found.start()
+
+
+def _frame_end(data: bytes, at: int) -> int:
+    """Where the candidate at `at` ends; past the data when too little is known."""
+    header = 10 if data[at] == MAGIC_V2 else 6
+    if len(data) < at + header:
+        return at + header + 2
+    end = at + header + data[at + 1] + 2
+    return end + SIGNATURE_LENGTH if header == 10 and data[at + 2] & SIGNED else end
+
+
+class _Header(NamedTuple):
+    flags: int
+    sequence: int
+    system: int
+    component: int
+    id: int
+    # positions in the data
+    magic: int
+    payload: int
+    crc: int
+
+
+def _header(data: bytes, at: int) -> _Header:
+    if data[at] == MAGIC_V2:
+        length, flags, sequence, system, component, low, high = _HEADER_V2.unpack_from(data, at)
+        return _Header(flags, sequence, system, component, low | high << 16, at, at + 10, at + 10 + length)
+    length, sequence, system, component, id_ = _HEADER_V1.unpack_from(data, at)
+    return _Header(0, sequence, system, component, id_, at, at + 6, at + 6 + length)
+
+
+def _checksum_fits(data: bytes, head: _Header, layout: _Layout) -> bool:
+    end = head.crc
+    return _crc(layout.extra, _crc(data[head.magic + 1 : end], _CRC_INIT)) == data[end] | data[end + 1] << 8
+
+
+def _hides_frame(data: bytes) -> bool:
+    """Whether a whole good frame with a known id stands somewhere in the data."""
+    for found in _ANY_MAGIC.finditer(data):
+        at = found.start()
+        if _frame_end(data, at) <= len(data):
+            head = _header(data, at)
+            layout = _LAYOUTS.get(head.id)
+            if layout is not None and _checksum_fits(data, head, layout):
+                return True
+    return False
+
+
+def _decode(layout: _Layout, payload: bytes) -> Message:
+    # MAVLink 2 cuts trailing zeros; a longer payload comes from a newer definition with more extensions.
+    values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))
+    arguments = [values[i : i + n] if n else values[i] for i, n in layout.slots]
+    return layout.make(*(a.rstrip(b"\0") if isinstance(a, bytes) else a for a in arguments))
