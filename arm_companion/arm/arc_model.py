@@ -1,0 +1,261 @@
+"""The paper's one arc of constant curvature behind the interface of `model`: the rod's zeroth mode.
+
+Exact without load; under load far too stiff (an arc can only bend as a whole), and a held tip is met only
+as far as two degrees of freedom allow. It serves for comparison; the rod flies.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arm_companion.arm import arc, statics, stiffness
+from arm_companion.arm.model import ArmSolution, Derivatives, Hold, MassMoments, Payload
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.errors import ConfigError, LimitViolated, NoSolution
+from arm_companion.geometry import so3, wrench
+from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
+
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(6)
+_SIGMA = 0.5 * (_NODES + 1)
+_SHARE = 0.5 * _WEIGHTS
+_ITERATIONS = 50
+_TOLERANCE = 1e-11
+_STEP = 1e-6
+
+_BaseWrench = Callable[[ArmParameters, Array], Array]
+
+
+class ArcModel:
+    """`ArmModel` by the arc; one segment only.
+
+    Raises:
+        ConfigError: for an arm of several segments.
+    """
+
+    def __init__(self, parameters: ArmParameters) -> None:
+        if len(parameters.segments) != 1:
+            raise ConfigError("the arc model has one segment")
+        self._parameters = parameters
+
+    @property
+    def parameters(self) -> ArmParameters:
+        """The arm."""
+        return self._parameters
+
+    def pull_for_bend(self, bend: ArrayLike, pretension: float | None = None) -> Array:
+        """See `ArmModel.pull_for_bend`."""
+        return statics.pull_for_bend(self._parameters, bend, pretension)
+
+    def pull_for_tension(self, bend: ArrayLike, tension: ArrayLike) -> Array:
+        """See `ArmModel.pull_for_tension`."""
+        return statics.pull_for_tension(self._parameters, bend, tension)
+
+    def bend_for_pull(self, pull: ArrayLike) -> Array:
+        """See `ArmModel.bend_for_pull`."""
+        return statics.bend_for_pull(self._parameters, pull)
+
+    def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
+        """See `ArmModel.bend_for_tip`."""
+        L = self._parameters.L
+        return arc.bend_for_tip(p_tip_base, L, 0.01 * L if tolerance is None else tolerance)
+
+    def free(
+        self,
+        pull: ArrayLike,
+        gravity: ArrayLike,
+        tip_wrench: ArrayLike | None = None,
+        payload: Payload | None = None,
+        *,
+        start: ArmSolution | None = None,
+    ) -> ArmSolution:
+        """See `ArmModel.free`; a payload counts as a point at the tip."""
+        P = self._parameters
+        q = frozen(pull, (P.n,), "pull")
+        g = frozen(gravity, (3,), "gravity")
+        w = frozen(np.zeros(6) if tip_wrench is None else tip_wrench, (6,), "tip_wrench")
+        end_mass = P.segments[0].end_mass + (0.0 if payload is None else payload.mass)
+        u, residual, iterations = _equilibrium(P, q, _Loads.of(P, g, w, end_mass), start)
+
+        def base(changed: ArmParameters, x: Array) -> Array:
+            n = changed.n
+            return ArcModel(changed).free(x[:n], x[n : n + 3], x[n + 3 :], payload).base_wrench
+
+        detail = _Detail(P, u, end_mass, np.zeros(P.n), w, base, np.concatenate((q, g, w)), held=False)
+        tip, R = arc.tip_position(u, P.L), arc.tip_rotation(u)
+        tension = statics.stretch_tension(P, u, q)
+        return _solution(detail, q, g, tip, R, tension, residual, iterations, float("nan"))
+
+    def held(self, pull: ArrayLike, hold: Hold, gravity: ArrayLike, *, start: ArmSolution | None = None) -> ArmSolution:
+        """See `ArmModel.held`.
+
+        The held point pulls the arc as a spring along the two directions in which an arc can give; what lies
+        across them is not resisted, and its share of the displacement is the residual.
+        """
+        q = frozen(pull, (self._parameters.n,), "pull")
+        g = frozen(gravity, (3,), "gravity")
+        s, target = hold.arc_length, hold.pose.position
+        reach = float(np.sqrt(target @ target))
+        if reach >= s:
+            raise LimitViolated("distance of the held section from the base", reach, 0.0, s)
+        P = self._parameters.up_to(s)
+        beyond = np.zeros(P.n) if hold.beyond is None else hold.beyond
+        end_mass = P.segments[0].end_mass
+        u, _, iterations = _equilibrium(P, q - beyond, _Loads.of(P, g, np.zeros(6), end_mass), start)
+        J = arc.jacobian(u, s)[:3]
+        away = target - arc.tip_position(u, s)
+        give = np.linalg.lstsq(J, away, rcond=None)[0]
+        K = stiffness.bend_stiffness(P, u, statics.stretch_tension(P, u, q - beyond))
+        push = np.concatenate((np.linalg.lstsq(J.T, K @ give, rcond=None)[0], np.zeros(3)))
+
+        def base(changed: ArmParameters, x: Array) -> Array:
+            n = changed.n
+            moved = replace(hold, pose=hold.pose.moved(x[n + 3 :]))
+            return ArcModel(changed).held(x[:n], moved, x[n : n + 3]).base_wrench
+
+        point = np.concatenate((q, g, np.zeros(6)))
+        detail = _Detail(P, u, end_mass, beyond, push, base, point, held=True, whole=self._parameters)
+        residual = float(np.abs(away - J @ give).max()) / s
+        tension = statics.stretch_tension(P, u + give, q - beyond)
+        return _solution(detail, q, g, target, hold.pose.rotation, tension, residual, iterations, s - reach)
+
+    def anchor(self, hold: Hold, pull: ArrayLike, tension: ArrayLike, gravity: ArrayLike) -> Hold:
+        """See `ArmModel.anchor`; the arc between base and hold takes the bend that the tensions give it."""
+        P = self._parameters.up_to(hold.arc_length)
+        frozen(gravity, (3,), "gravity")
+        tau = frozen(tension, (P.n,), "tension")
+        u = (tau @ P.H) / P.bending
+        return replace(hold, beyond=frozen(pull, (P.n,), "pull") - statics.pull_for_tension(P, u, tau))
+
+
+@dataclass(frozen=True, eq=False)
+class _Loads:
+    """Dead forces along the arc: (fraction of the length, force (3,)), and a tip wrench (6,)."""
+
+    points: tuple[tuple[float, Array], ...]
+    tip: Array
+
+    @classmethod
+    def of(cls, P: ArmParameters, gravity: Array, tip: Array, end_mass: float) -> "_Loads":
+        spread = P.segments[0].line_mass * P.L
+        points = [(float(x), float(w) * spread * gravity) for x, w in zip(_SIGMA, _SHARE, strict=True)]
+        return cls((*points, (1.0, end_mass * gravity)), tip)
+
+
+@dataclass(frozen=True, eq=False)
+class _Detail:
+    """`Detail` of an arc; derivatives by central differences."""
+
+    P: ArmParameters
+    u: Array
+    end_mass: float
+    beyond: Array
+    tip_wrench: Array
+    base: _BaseWrench
+    point: Array  # pull, gravity, and tip wrench or twist of the hold
+    held: bool
+    whole: ArmParameters | None = None
+
+    def moments(self) -> MassMoments:
+        """See `Detail.moments`."""
+        L = self.P.L
+        points = np.array([arc.tip_position(x * self.u, x * L) for x in (*_SIGMA, 1.0)])
+        return MassMoments.of_points(np.append(_SHARE * self.P.segments[0].line_mass * L, self.end_mass), points)
+
+    def sections(self, at: Array) -> tuple[Array, Array]:
+        """See `Detail.sections`."""
+        shares = [float(s) / self.P.L for s in at]
+        return (
+            np.array([arc.tip_rotation(x * self.u) for x in shares]),
+            np.array([arc.tip_position(x * self.u, x * self.P.L) for x in shares]),
+        )
+
+    def path_beyond(self, s: float) -> Array:
+        """See `Detail.path_beyond`."""
+        rest = 1 - s / self.P.L
+        return np.asarray(self.beyond + rest * (self.P.H @ self.u + self.P.chord_loss @ (self.u * self.u)))
+
+    def derivatives(self) -> Derivatives:
+        """See `Detail.derivatives`."""
+        P = self.whole or self.P
+        n = P.n
+        D = np.empty((6, self.point.size))
+        for j, step in enumerate(_STEP * np.eye(self.point.size)):
+            D[:, j] = (self.base(P, self.point + step) - self.base(P, self.point - step)) / (2 * _STEP)
+        relative = {}
+        for name in ("EI", "GJ", "k_T", "T0"):
+            up, down = P.scaled(**{name: 1 + _STEP}), P.scaled(**{name: 1 - _STEP})
+            relative[name] = sealed((self.base(up, self.point) - self.base(down, self.point)) / (2 * _STEP))
+        tension = statics.stretch_tension(self.P, self.u, self.point[:n] - self.beyond)
+        return Derivatives(
+            pull=sealed(D[:, :n].copy()),
+            gravity=sealed(D[:, n : n + 3].copy()),
+            hold=sealed(self.held * D[:, n + 3 :]),
+            tip_wrench=sealed((not self.held) * D[:, n + 3 :]),
+            parameters=relative,
+            compliance=sealed(stiffness.tip_compliance(self.P, self.u, tension, self.tip_wrench)),
+        )
+
+
+def _solution(
+    detail: _Detail,
+    pull: Array,
+    gravity: Array,
+    tip: Array,
+    R: Array,
+    tension: Array,
+    residual: float,
+    iterations: int,
+    margin: float,
+) -> ArmSolution:
+    moments = detail.moments()
+    base = wrench.at_point(detail.tip_wrench, tip)
+    base[:3] += moments.mass * gravity
+    base[3:] += so3.cross(moments.first, gravity)
+    return ArmSolution(
+        pull=pull,
+        bend=sealed(detail.u),
+        tip_position=sealed(tip),
+        tip_rotation=sealed(R),
+        tension=sealed(tension),
+        base_wrench=sealed(base),
+        tip_wrench=sealed(detail.tip_wrench),
+        residual=residual,
+        taut_margin=margin,
+        gravity=gravity,
+        arc_length=detail.P.L,
+        coordinates=detail.u,
+        iterations=iterations,
+        detail=detail,
+    )
+
+
+def _equilibrium(P: ArmParameters, pull: Array, loads: _Loads, start: ArmSolution | None) -> tuple[Array, float, int]:
+    u = statics.bend_for_pull(P, pull) if start is None else np.array(start.bend)
+    scale = float(P.bending.max()) + float(P.k_T.max()) * P.r**2
+    residual = np.inf
+    for iteration in range(_ITERATIONS):
+        g, K = _force_and_stiffness(P, u, pull, loads)
+        residual = float(np.abs(g).max()) / scale
+        if residual < _TOLERANCE:
+            return u, residual, iteration
+        step = np.linalg.solve(K, g)
+        for _ in range(20):
+            trial, _ = _force_and_stiffness(P, u - step, pull, loads)
+            if float(trial @ trial) < float(g @ g):
+                break
+            step = 0.5 * step
+        u = u - step
+    raise NoSolution(residual, "loaded arc")
+
+
+def _force_and_stiffness(P: ArmParameters, u: Array, pull: Array, loads: _Loads) -> tuple[Array, Array]:
+    """Unbalanced generalised force (2,) and its derivative (2, 2) at the bend u."""
+    tau = statics.stretch_tension(P, u, pull)
+    g = statics.bending_moment(P, u, tau) - arc.jacobian(u, P.L).T @ loads.tip
+    K = stiffness.bend_stiffness(P, u, tau, loads.tip)
+    for x, force in loads.points:
+        w = np.concatenate((force, np.zeros(3)))
+        g = g - x * (arc.jacobian(x * u, x * P.L).T @ w)
+        K = K - x * x * arc.twist_jacobians(x * u, w, x * P.L)
+    return g, K
