@@ -1,0 +1,333 @@
+"""The Dynamixel bus and its servos: the one owner of the port.
+
+A cycle is one Sync Read of what every servo measures and, once the mission has decided, one Sync Write of
+goals. What fails is tried again while the cycle's deadline allows, and otherwise shows in the servos' states;
+one servo's failure never keeps goals from the others. `run` keeps the port open through loss and return.
+"""
+
+import asyncio
+import logging
+import random
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from arm_companion.config.schema import ServosConfig
+from arm_companion.drivers.servo_health import ServoCounters, ServoRecord, ServoState
+from arm_companion.drivers.servo_link import ServoLink
+from arm_companion.drivers.servo_reader import ServoReader
+from arm_companion.drivers.servo_setup import ServoInfo, Settings, set_up
+from arm_companion.errors import DeviceFault, LinkError
+from arm_companion.protocol import control_table as ct
+from arm_companion.protocol import dynamixel as dxl
+from arm_companion.transport.base import Opener, Transport
+
+_log = logging.getLogger(__name__)
+
+SPEED_LIMIT_RAD_PER_S = 6.0
+"""Of the servos' own trajectories, just under what an XL430 does at 12 V."""
+
+_CHECK_S = 0.25  # between attempts to set up a servo that is not
+_TORQUE_RETRY_S = 0.2
+_TRIES = 4
+_RECONNECT_FIRST_S = 0.05
+_RECONNECT_LONGEST_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class BusCounters:
+    """History of the bus and of each servo on it."""
+
+    servos: dict[int, ServoCounters]
+    frames: int
+    garbage_bytes: int
+    crc_errors: int
+    strays: int
+    reconnects: int
+    latency_s: float  # mean time of a transaction beyond its time on the wire
+
+
+class ServoBus:
+    """All servos of the arm, in the tendons' order."""
+
+    def __init__(
+        self,
+        opener: Opener,
+        config: ServosConfig,
+        *,
+        speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S,
+        rng: random.Random | None = None,
+    ) -> None:
+        """Nothing is opened before `start` or `run`.
+
+        Args:
+            opener: of the serial device, or of whatever leads to it.
+            config: which servos, how fast, which deadlines.
+            speed_limit_rad_per_s: set in every servo as the speed of its own trajectory.
+            rng: spreads reconnections in time.
+        """
+        self._opener = opener
+        self._config = config
+        self._rng = rng or random.SystemRandom()
+        self._link = ServoLink(config.baud, config.reply_timeout_s)
+        self._records = tuple(ServoRecord(servo, config.silent_after) for servo in config.ids)
+        self._by_id = {record.id: record for record in self._records}
+        self._settings = Settings(
+            watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
+            profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
+        )
+        self._reader = ServoReader(self._link, self._records, config, self._settings)
+        self._transport: Transport | None = None
+        self._opening = asyncio.Lock()
+        self._next_torque_at = 0.0
+        self._last_reported: dict[int, str] = {}
+        self.info: dict[int, ServoInfo] = {}
+        self.reconnects = 0
+
+    # Life of the link.
+
+    async def start(self) -> None:
+        """Open the port if need be and prepare every servo for goals; also what clears a watchdog trip.
+
+        Torque stays as it is. All servos are tried whatever happens to one.
+
+        Raises:
+            LinkError: the port cannot be opened.
+            ExceptionGroup: of one `DeviceFault` for each servo that could not be prepared.
+        """
+        await self._connect()
+        await self._for_each("start", self._records, self._set_up)
+
+    async def run(self) -> None:
+        """Keep the port open and new servos set up, until cancelled.
+
+        A servo that lost its power is set up again, and stays marked as having lost its turns. A watchdog
+        trip in a servo that was set up before stays until `start`.
+        """
+        delay = _RECONNECT_FIRST_S
+        while True:
+            try:
+                transport = await self._connect()
+            except LinkError as error:
+                self._report(-1, str(error))
+                await asyncio.sleep(delay * (0.5 + 0.5 * self._rng.random()))
+                delay = min(2 * delay, _RECONNECT_LONGEST_S)
+                continue
+            self._report(-1, "")
+            delay = _RECONNECT_FIRST_S
+            async with asyncio.TaskGroup() as group:
+                setting_up = group.create_task(self._keep_set_up())
+                await transport.wait_closed()
+                setting_up.cancel()
+            self._disconnect()
+            self.reconnects += 1
+
+    async def stop(self, *, limp: bool) -> None:
+        """Release the port, with the torque off if `limp`; otherwise servos keep holding what they hold.
+
+        Raises:
+            ExceptionGroup: of one `DeviceFault` for each servo that may still hold, after the port is closed.
+        """
+        try:
+            if limp:
+                await self.limp()
+        finally:
+            transport = self._transport
+            self._disconnect()
+            if transport is not None:
+                transport.close()
+                await transport.wait_closed()
+
+    async def _for_each(
+        self, what: str, records: Iterable[ServoRecord], action: Callable[[ServoRecord], Awaitable[None]]
+    ) -> None:
+        faults = []
+        for record in records:
+            try:
+                await action(record)
+            except DeviceFault as fault:
+                faults.append(fault)
+        _raise(what, faults)
+
+    async def _connect(self) -> Transport:
+        async with self._opening:
+            if self._transport is None:
+                self._transport = await self._opener(self._link.receive)
+                self._link.attach(self._transport)
+            return self._transport
+
+    def _disconnect(self) -> None:
+        self._transport = None
+        self._link.detach()
+
+    async def _keep_set_up(self) -> None:
+        while True:
+            for record in self._records:
+                if not record.set_up:
+                    try:
+                        await self._set_up(record)
+                    except DeviceFault as fault:
+                        self._report(record.id, str(fault))
+                    else:
+                        self._report(record.id, "")
+            await asyncio.sleep(_CHECK_S)
+
+    async def _set_up(self, record: ServoRecord) -> None:
+        self.info[record.id] = await set_up(self._link, record, self._settings)
+
+    def _report(self, servo: int, trouble: str) -> None:
+        """Log what is wrong once, and once that it is over."""
+        if trouble == self._last_reported.get(servo, ""):
+            return
+        self._last_reported[servo] = trouble
+        name = "servo bus" if servo < 0 else f"servo {servo}"
+        _log.log(logging.WARNING if trouble else logging.INFO, "%s: %s", name, trouble or "well again")
+
+    # The cycle.
+
+    async def cycle(self, goals: Sequence[int] | None) -> tuple[ServoState, ...]:
+        """One `write` and one `read`."""
+        await self.write(goals)
+        return await self.read()
+
+    async def read(self) -> tuple[ServoState, ...]:
+        """Hear every servo, by the configuration's deadline at the latest, and return all states.
+
+        Never raises on a servo's or the link's behalf: what went wrong is in the states.
+        """
+        await self._reader.read()
+        lost = [r for r in self._records if r.goal_lost and r.movable]
+        if lost:
+            await self._send_goals(lost)
+        now = asyncio.get_running_loop().time()
+        return tuple(record.state(now, self._config.silent_after) for record in self._records)
+
+    async def write(self, goals: Sequence[int] | None, *, torque: bool = False) -> None:
+        """Send a goal to every servo that may move, in one frame.
+
+        Args:
+            goals: ticks, in the servos' order; None repeats the last ones.
+            torque: switch the torque on first where it is off; the servo then starts from where it is.
+
+        Raises:
+            ValueError: a goal is no position of the extended-position mode, or their number is wrong.
+        """
+        if goals is not None:
+            if len(goals) != len(self._records):
+                raise ValueError(f"{len(goals)} goals for {len(self._records)} servos")
+            if any(abs(goal) > ct.EXTENDED_POSITION_LIMIT_TICKS for goal in goals):
+                raise ValueError(f"goals {list(goals)} exceed +-{ct.EXTENDED_POSITION_LIMIT_TICKS} ticks")
+        if torque:
+            await self._torque_where_off()
+        movable = [r for r in self._records if r.movable]
+        if goals is not None:
+            for record, goal in zip(self._records, goals, strict=True):
+                if record.movable:
+                    record.goal = goal
+        await self._send_goals(movable)
+
+    async def _send_goals(self, records: Sequence[ServoRecord]) -> None:
+        data = {r.id: ct.GOAL_POSITION.encode(r.goal) for r in records if r.goal is not None}
+        if data:
+            await self._link.tell(dxl.sync_write(ct.GOAL_POSITION.address, data))
+            for record in records:
+                record.goal_lost = False
+
+    # Torque.
+
+    async def torque(self, on: bool) -> None:
+        """Switch the torque of every servo; one that comes on stays where it is.
+
+        Raises:
+            ExceptionGroup: of one `DeviceFault` for each servo that did not obey, after all were tried.
+        """
+        if not on:
+            await self.limp()
+            return
+        for _ in range(_TRIES):
+            await self._reader.read()
+            await self._switch_on([r for r in self._records if not r.torque])
+        _raise("torque on", [_fault(r, "its torque does not come on") for r in self._records if not r.torque])
+
+    async def limp(self) -> None:
+        """Let every servo go: one frame to all of them at once, then each one until it confirms.
+
+        Does nothing once all have confirmed.
+
+        Raises:
+            ExceptionGroup: of one `DeviceFault` for each servo that did not confirm, after all were tried.
+        """
+        holding = [r for r in self._records if r.torque or r.missed]
+        if holding:
+            off = ct.TORQUE_ENABLE.encode(0)
+            await self._link.tell(dxl.sync_write(ct.TORQUE_ENABLE.address, {r.id: off for r in self._records}))
+            await self._for_each("torque off", holding, self._switch_off)
+
+    async def _switch_off(self, record: ServoRecord) -> None:
+        await self._link.write(record.id, ct.TORQUE_ENABLE, 0)
+        record.torque = False
+        record.goal = None
+
+    async def _torque_where_off(self) -> None:
+        off = [r for r in self._records if r.movable and not (r.torque or r.error_bits or r.missed)]
+        now = asyncio.get_running_loop().time()
+        if off and now >= self._next_torque_at:
+            self._next_torque_at = now + _TORQUE_RETRY_S
+            await self._switch_on(off)
+
+    async def _switch_on(self, records: Sequence[ServoRecord]) -> None:
+        """Switch on those servos that are seen to have their present position as goal."""
+        fresh = [r for r in records if r.set_up and r.feedback is not None and not r.missed]
+        for record in fresh:
+            record.hold()
+        await self._send_goals(fresh)
+        deadline = asyncio.get_running_loop().time() + self._config.reply_timeout_s
+        await self._reader.check_goals(fresh, deadline)
+        holding = [r for r in fresh if r.goal_confirmed]
+        if holding:
+            on = ct.TORQUE_ENABLE.encode(1)
+            await self._link.tell(dxl.sync_write(ct.TORQUE_ENABLE.address, {r.id: on for r in holding}))
+            await self._reader.check_torque(holding, deadline)
+
+    async def reboot(self, servo: int) -> None:
+        """Restart a servo, the way out of a shutdown. Its torque goes, and with it its turns.
+
+        Raises:
+            DeviceFault: it does not answer.
+            KeyError: no servo of the arm has this id.
+        """
+        record = self._by_id[servo]
+        await self._link.command(servo, dxl.reboot(servo))
+        record.lose_power()
+        record.error_bits = 0
+
+    def accept_position(self, servo: int) -> None:
+        """Trust a servo's position again, once its tendon has been homed.
+
+        Raises:
+            KeyError: no servo of the arm has this id.
+        """
+        self._by_id[servo].turns_lost = False
+
+    def counters(self) -> BusCounters:
+        """History of the bus, for telemetry."""
+        parser = self._link.parser
+        return BusCounters(
+            servos={r.id: r.counters for r in self._records},
+            frames=parser.frames,
+            garbage_bytes=parser.garbage,
+            crc_errors=parser.crc_errors,
+            strays=self._link.strays,
+            reconnects=self.reconnects,
+            latency_s=self._link.latency.mean_s,
+        )
+
+
+def _fault(record: ServoRecord, otherwise: str) -> DeviceFault:
+    if record.missed:
+        return DeviceFault(record.id, 0, "does not answer")
+    return DeviceFault(record.id, record.error_bits, "" if record.error_bits else otherwise)
+
+
+def _raise(what: str, faults: Sequence[DeviceFault]) -> None:
+    if faults:
+        raise ExceptionGroup(f"{what}: {len(faults)} of the servos failed", faults)

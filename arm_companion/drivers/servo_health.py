@@ -1,0 +1,144 @@
+"""What is known of one servo: its last answer, its faults, and the history that telemetry shows."""
+
+import math
+from dataclasses import dataclass, field
+
+from arm_companion.protocol.control_table import (
+    LOAD_FULL,
+    TICK_CLOCK_MODULUS_MS,
+    TICK_RAD,
+    VELOCITY_UNIT_RAD_PER_S,
+    VOLTAGE_UNIT_V,
+    Echo,
+    Feedback,
+)
+
+_FASTEST_TICKS_PER_S = 8000.0  # well beyond the 61 rev/min of an unloaded XL430
+_JUMP_TICKS = 128.0
+_CLOCK_TOLERANCE_MS = 60.0
+_CLOCK_DRIFT = 0.03
+_CLOCK_MEMORY_S = 8.0  # older comparisons are ambiguous: the servo's clock wraps after 33 s
+
+
+@dataclass(frozen=True, slots=True)
+class ServoState:
+    """One servo as it last answered, in its own sense of direction."""
+
+    id: int
+    position: int  # ticks
+    speed: float  # ticks/s
+    load: float  # share of full load, positive towards growing positions
+    voltage: float  # V
+    temperature: float  # degC
+    error_bits: int  # hardware errors, register 70
+    torque: bool  # torque is on
+    tripped: bool  # its bus watchdog stopped it: goals are refused until `start`
+    turns_lost: bool  # it lost power or jumped: the position says nothing of the tendon until homed
+    ready: bool  # set up, and nothing stands in the way of goals
+    silent: bool  # has not answered for several cycles, or never
+    age_s: float  # since its last answer, inf: never answered
+
+
+@dataclass(slots=True)
+class ServoCounters:
+    """History of one servo since the daemon started."""
+
+    answers: int = 0
+    lost: int = 0  # requests without a good answer; each is tried again
+    missed_cycles: int = 0  # cycles without any good answer
+    alerts: int = 0  # cycles in which it said that a hardware error stands
+    power_losses: int = 0
+    watchdog_trips: int = 0
+    goals_lost: int = 0  # goals found not to have arrived, and sent again
+
+
+@dataclass(slots=True)
+class ServoRecord:
+    """The bus driver's mind about one servo."""
+
+    id: int
+    missed: int  # cycles in a row without an answer
+    counters: ServoCounters = field(default_factory=ServoCounters)
+    feedback: Feedback | None = None
+    answered_at: float = -math.inf
+    goal: int | None = None  # ticks, last one sent
+    goal_lost: bool = False  # the servo was found to have another one
+    goal_confirmed: bool = False  # the servo was found to have this one
+    error_bits: int = 0
+    torque: bool = False
+    tripped: bool = False
+    turns_lost: bool = False
+    set_up: bool = False
+    _tick_ms: int = 0
+    _tick_at: float = -math.inf
+
+    def take(self, feedback: Feedback, now: float) -> None:
+        """Note an answer. A position that no motion explains marks the turns as lost."""
+        if self.feedback is not None:
+            possible = _JUMP_TICKS + _FASTEST_TICKS_PER_S * (now - self.answered_at)
+            if abs(feedback.position - self.feedback.position) > possible:
+                self.turns_lost = True
+        self.feedback = feedback
+        self.answered_at = now
+        self.missed = 0
+        self.counters.answers += 1
+
+    def take_echo(self, echo: Echo, now: float) -> None:
+        """Compare what the servo has with what it was sent, and its clock with ours."""
+        self.goal_confirmed = echo.goal == self.goal
+        self.goal_lost = self.torque and self.goal is not None and not self.goal_confirmed
+        self.counters.goals_lost += self.goal_lost
+        elapsed = now - self._tick_at
+        if elapsed < _CLOCK_MEMORY_S:
+            off = (echo.tick_ms - self._tick_ms - elapsed * 1000) % TICK_CLOCK_MODULUS_MS
+            off = min(off, TICK_CLOCK_MODULUS_MS - off)
+            if off > _CLOCK_TOLERANCE_MS + _CLOCK_DRIFT * 1000 * elapsed:
+                self.lose_power()
+        self._tick_ms, self._tick_at = echo.tick_ms, now
+
+    @property
+    def movable(self) -> bool:
+        """Goals mean something to it, and it would follow them."""
+        return self.set_up and not (self.turns_lost or self.tripped)
+
+    def hold(self) -> None:
+        """Make the position last heard the goal."""
+        if self.feedback is not None:
+            self.goal = self.feedback.position
+            self.goal_confirmed = False
+
+    def take_watchdog(self, *, tripped: bool) -> None:
+        """Note whether the bus watchdog has stopped the servo."""
+        if tripped and not self.tripped:
+            self.counters.watchdog_trips += 1
+        self.tripped = tripped
+
+    def lose_power(self) -> None:
+        """The servo started afresh: what was set up, and the turns it had counted, are gone."""
+        self.counters.power_losses += 1
+        self.turns_lost = True
+        self.torque = False
+        self.set_up = False
+        self.tripped = False
+        self.goal = None
+        self.goal_lost = False
+        self._tick_at = -math.inf
+
+    def state(self, now: float, silent_after: int) -> ServoState:
+        """The servo's state for the rest of the daemon."""
+        raw = self.feedback or Feedback(0, 0, 0, 0, 0, 0, 0, 0)
+        return ServoState(
+            id=self.id,
+            position=raw.position,
+            speed=raw.velocity * (VELOCITY_UNIT_RAD_PER_S / TICK_RAD),
+            load=raw.load / LOAD_FULL,
+            voltage=raw.voltage * VOLTAGE_UNIT_V,
+            temperature=float(raw.temperature),
+            error_bits=self.error_bits,
+            torque=self.torque,
+            tripped=self.tripped,
+            turns_lost=self.turns_lost,
+            ready=self.movable and not self.error_bits,
+            silent=self.missed >= silent_after,
+            age_s=now - self.answered_at,
+        )

@@ -1,0 +1,214 @@
+"""One transaction at a time on a Dynamixel bus: a request out, the answers of one or more servos in.
+
+This layer knows bytes, frames and time. Which servos there are and what their registers mean is the business
+of `servo_bus`.
+"""
+
+import asyncio
+from collections.abc import Sequence
+
+from arm_companion.errors import DeviceFault
+from arm_companion.protocol import dynamixel as dxl
+from arm_companion.protocol.control_table import RETURN_DELAY_UNIT_S, Register
+from arm_companion.protocol.dynamixel import Packet
+from arm_companion.transport.base import Transport
+
+_BITS_PER_BYTE = 10
+_TURNAROUND_S = 50e-6  # a servo's own time to begin an answer
+_TRIES = 4
+_DRAIN_S = 0.004
+_LATE_S = 0.005
+
+
+class Latency:
+    """How much longer than its time on the wire a transaction takes: smoothed mean and deviation.
+
+    The smoothing and the margin are those of TCP's retransmission timer (RFC 6298).
+    """
+
+    LEAST_S = 0.001
+    """No margin is shorter: timers and a busy machine take that much."""
+
+    def __init__(self) -> None:
+        self.mean_s = 0.0
+        self.deviation_s = 0.0
+        self._known = False
+
+    def learn(self, extra_s: float) -> None:
+        """Take in one measurement."""
+        if not self._known:
+            self.mean_s, self.deviation_s, self._known = extra_s, extra_s / 2, True
+            return
+        self.deviation_s += (abs(extra_s - self.mean_s) - self.deviation_s) / 4
+        self.mean_s += (extra_s - self.mean_s) / 8
+
+    @property
+    def margin_s(self) -> float:
+        """How long to wait beyond the time on the wire before an answer counts as lost."""
+        return max(self.mean_s + 4 * self.deviation_s, self.LEAST_S)
+
+
+class ServoLink:
+    """The open bus.
+
+    Attributes:
+        latency: beyond the time on the wire, learnt from complete transactions.
+        strays: status frames that nobody waited for.
+    """
+
+    def __init__(self, baud: int, timeout_s: float) -> None:
+        """Speak at `baud` bits per second and wait at most `timeout_s` for the answers to one request."""
+        self.latency = Latency()
+        self.parser = dxl.Parser()
+        self.strays = 0
+        self._byte_s = _BITS_PER_BYTE / baud
+        self._timeout_s = timeout_s
+        self._return_delays: dict[int, float] = {}
+        self._transport: Transport | None = None
+        self._lock = asyncio.Lock()
+        self._line_free_at = 0.0
+        self._waiting: asyncio.Future[None] | None = None
+        self._wanted: Sequence[int] = ()
+        self._size = 0
+        self._answers: dict[int, Packet] = {}
+        self._owed: dict[int, float] = {}  # when an answer that has not come should have ended
+
+    @property
+    def connected(self) -> bool:
+        """There is a transport to write to."""
+        return self._transport is not None
+
+    def attach(self, transport: Transport) -> None:
+        """Use this transport from now on; its receiver must be `receive`."""
+        self._transport = transport
+        self.parser.reset()
+
+    def detach(self) -> None:
+        """The transport is gone; whoever waits for answers stops waiting."""
+        self._transport = None
+        self._finish()
+
+    def expect_return_delay(self, servo: int, raw: int) -> None:
+        """Take a servo's return-delay register into account when waiting for it."""
+        self._return_delays[servo] = raw * RETURN_DELAY_UNIT_S
+
+    def receive(self, data: bytes) -> None:
+        """Receiver of the transport."""
+        for packet in self.parser.feed(data):
+            if packet.instruction != dxl.Instruction.STATUS:
+                continue  # our own request, which some adapters echo
+            fits = len(packet.parameters) == self._size or packet.error & ~dxl.ALERT
+            if self._waiting is None or packet.id not in self._wanted or not fits:
+                self.strays += 1
+                if packet.id in self._owed:  # late, and so a lesson
+                    self.latency.learn(asyncio.get_running_loop().time() - self._owed.pop(packet.id))
+                continue
+            self._answers[packet.id] = packet
+            # Servos answer in the order of the request: after the last one nobody will.
+            if packet.id == self._wanted[-1]:
+                self._finish()
+
+    async def ask(self, request: bytes, servos: Sequence[int], size: int, deadline: float) -> dict[int, Packet]:
+        """Send `request`; answers by servo id, without those that did not come in time.
+
+        Args:
+            request: one frame.
+            servos: who has to answer, in the order in which they will.
+            size: bytes of data in each answer.
+            deadline: loop time at which to stop waiting whatever the wire would still allow.
+        """
+        async with self._lock:
+            loop = asyncio.get_running_loop()
+            begin = loop.time()
+            if self._transport is None or not servos or begin >= deadline:
+                return {}
+            self.parser.reset()
+            self._wanted, self._size, self._answers = servos, size, {}
+            self._waiting = loop.create_future()
+            self._transport.write(request)
+            self._occupy(begin, len(request) + len(servos) * (size + dxl.STATUS_OVERHEAD))
+            for servo in servos:
+                self._line_free_at += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
+            wire = self._line_free_at
+            timer = loop.call_at(min(wire + self.latency.margin_s, deadline), self._finish)
+            try:
+                await self._waiting
+            finally:
+                timer.cancel()
+                self._waiting = None
+            end = loop.time()
+            self._line_free_at = min(self._line_free_at, end)
+            unambiguous = not any(servo in self._owed for servo in servos)
+            if len(self._answers) == len(servos):
+                if unambiguous:
+                    self.latency.learn(max(end - wire, 0.0))
+                self._owed.clear()
+            else:
+                for servo in servos:
+                    if servo not in self._answers:
+                        self._owed.setdefault(servo, wire)
+            return self._answers
+
+    async def tell(self, request: bytes) -> None:
+        """Send a request that nobody answers."""
+        async with self._lock:
+            if self._transport is not None:
+                self._transport.write(request)
+                self._occupy(asyncio.get_running_loop().time(), len(request))
+
+    async def command(self, servo: int, request: bytes, size: int = 0) -> bytes:
+        """Data of one servo's answer; asks again when none comes.
+
+        Answers carry no number: before asking again, a late one is given time to come and be dropped.
+
+        Raises:
+            DeviceFault: when it stays silent, or refuses.
+        """
+        for attempt in range(_TRIES):
+            deadline = asyncio.get_running_loop().time() + self._timeout_s
+            answers = await self.ask(request, (servo,), size, deadline)
+            if servo in answers:
+                refusal = answers[servo].error & ~dxl.ALERT
+                if refusal:
+                    raise DeviceFault(servo, 0, f"refused a request: {_reason(refusal)}")
+                return answers[servo].parameters
+            if not self.connected:
+                raise DeviceFault(servo, 0, "the bus is not connected")
+            await asyncio.sleep(_DRAIN_S * 2**attempt)
+        late = self.latency.mean_s
+        hint = f"; answers come {late * 1e3:.0f} ms late: see the adapter's latency timer" if late > _LATE_S else ""
+        raise DeviceFault(servo, 0, "does not answer" + hint)
+
+    async def read(self, servo: int, register: Register) -> int:
+        """Value of a register.
+
+        Raises:
+            DeviceFault: when the servo stays silent, or refuses.
+        """
+        data = await self.command(servo, dxl.read(servo, register.address, register.size), register.size)
+        return register.decode(data)
+
+    async def write(self, servo: int, register: Register, value: int) -> None:
+        """Set a register, and have it acknowledged.
+
+        Raises:
+            DeviceFault: when the servo stays silent, or refuses.
+        """
+        try:
+            await self.command(servo, dxl.write(servo, register.address, register.encode(value)))
+        except DeviceFault as fault:
+            raise DeviceFault(servo, 0, f"{register.name} = {value}: {fault}") from fault
+
+    def _occupy(self, begin: float, n_bytes: int) -> None:
+        self._line_free_at = max(begin, self._line_free_at) + n_bytes * self._byte_s
+
+    def _finish(self) -> None:
+        if self._waiting is not None and not self._waiting.done():
+            self._waiting.set_result(None)
+
+
+def _reason(code: int) -> str:
+    try:
+        return dxl.StatusError(code).name.lower().replace("_", " ") + " error"
+    except ValueError:
+        return f"error {code}"

@@ -1,0 +1,185 @@
+"""Telemetry: what the arm does, feels and predicts, as messages of the dialect at each link's rates."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Final, TypeVar
+
+from arm_companion.clock import Clock
+from arm_companion.config.schema import RatesConfig
+from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.mission.facts import StatusReport, TendonState, WrenchReport, WrenchSource
+from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.mavlink import Message
+
+STATUS: Final = mav.MAVLINK_MSG_ID_ARM_STATUS
+TENDONS: Final = mav.MAVLINK_MSG_ID_ARM_TENDONS
+WRENCH: Final = mav.MAVLINK_MSG_ID_ARM_REACTION_WRENCH
+
+PER_MESSAGE: Final = 4
+"""Tendons that fit into one ARM_TENDONS."""
+
+_BEHAVIOURS: Final = {
+    entry.name.removeprefix("ARM_BEHAVIOUR_"): value for value, entry in mav.enums["ARM_BEHAVIOUR"].items()
+}
+Number = TypeVar("Number", int, float)
+
+_INT16_MAX: Final = 32_767
+_UINT16_MAX: Final = 65_535
+_UINT8_MAX: Final = 255
+
+# Hardware-error bits of a servo and the errors of the arm that they mean.
+_SERVO_ERRORS: Final = (
+    (0x01, mav.ARM_ERROR_LOW_VOLTAGE),
+    (0x04, mav.ARM_ERROR_OVERHEAT),
+    (0x20, mav.ARM_ERROR_OVERLOAD),
+)
+_SOURCE_FLAGS: Final = {
+    WrenchSource.FREE: 0,
+    WrenchSource.CONTACT: mav.ARM_FLAG_CONTACT,
+    WrenchSource.ANCHORED: mav.ARM_FLAG_CONTACT | mav.ARM_FLAG_ANCHORED,
+    WrenchSource.PAYLOAD: mav.ARM_FLAG_PAYLOAD,
+}
+
+
+class Telemetry:
+    """Sends what is due on each link.
+
+    Args:
+        links: all links; each has its own rates, which SET_MESSAGE_INTERVAL changes.
+        rates: rates at the start.
+        clock: Unix time of the stamps.
+    """
+
+    def __init__(self, links: Sequence[MavlinkLink], rates: RatesConfig, clock: Clock) -> None:
+        self._links = links
+        self._clock = clock
+        for link in links:
+            link.streams.offer(STATUS, rates.status_hz)
+            link.streams.offer(TENDONS, rates.tendons_hz)
+            link.streams.offer(WRENCH, rates.wrench_hz)
+
+    def publish(
+        self,
+        now: float,
+        status: StatusReport,
+        tendons: Sequence[TendonState],
+        wrench: WrenchReport,
+        goals: Sequence[float] | None = None,
+    ) -> None:
+        """Send whichever messages are due; called once a cycle.
+
+        Args:
+            now: loop time, s.
+            status: what the arm does. Flags and errors that tendons and wrench show are added to its own.
+            tendons: state of each tendon.
+            wrench: predicted reaction wrench.
+            goals: commanded displacement of each tendon, m; None when there is none.
+        """
+        stamp = round(self._clock.unix(now) * 1e6)
+        self._offer(STATUS, now, lambda: iter((status_message(stamp, status, tendons, wrench),)))
+        self._offer(TENDONS, now, lambda: tendon_messages(stamp, tendons, goals))
+        self._offer(WRENCH, now, lambda: iter((wrench_message(stamp, wrench),)))
+
+    def _offer(self, id_: int, now: float, make: Callable[[], Iterator[Message]]) -> None:
+        """Make the messages once, if any link has them due, and send them there."""
+        due = [link for link in self._links if link.connected and link.streams.take_due(id_, now)]
+        if due:
+            for message in make():
+                for link in due:
+                    link.send(message, Priority.BULK)
+
+
+def status_message(stamp: int, status: StatusReport, tendons: Sequence[TendonState], wrench: WrenchReport) -> Message:
+    """ARM_STATUS.
+
+    Args:
+        stamp: Unix time, us.
+        status: what the mission reports.
+        tendons: they tell of the servos.
+        wrench: its source tells of contact.
+    """
+    flags, errors = status.flags | _SOURCE_FLAGS[wrench.source], status.error_bits
+    if tendons and not any(t.silent for t in tendons):
+        flags |= mav.ARM_FLAG_SERVOS_CONNECTED
+    if tendons and all(t.torque for t in tendons):
+        flags |= mav.ARM_FLAG_TORQUE_ON
+    for tendon in tendons:
+        errors |= mav.ARM_ERROR_SERVO_SILENT if tendon.silent else 0
+        errors |= mav.ARM_ERROR_SERVO_FAULT if tendon.error_bits else 0
+        for bit, error in _SERVO_ERRORS:
+            errors |= error if tendon.error_bits & bit else 0
+    return mav.MAVLink_arm_status_message(
+        stamp,
+        flags,
+        errors,
+        status.theta,
+        status.delta,
+        list(status.tip_position_a),
+        status.goal_theta,
+        status.goal_delta,
+        _BEHAVIOURS.get(status.behaviour.upper(), mav.ARM_BEHAVIOUR_UNKNOWN),
+        status.state_number,
+        status.progress,
+        mav.ARM_CALIBRATION_UNKNOWN,
+        status.state.encode("ascii", errors="replace")[:20],
+    )
+
+
+def wrench_message(stamp: int, wrench: WrenchReport) -> Message:
+    """ARM_REACTION_WRENCH.
+
+    Args:
+        stamp: Unix time, us.
+        wrench: about the airframe's centre of mass, body axes.
+    """
+    return mav.MAVLink_arm_reaction_wrench_message(
+        stamp,
+        list(wrench.force_b),
+        list(wrench.torque_b),
+        list(wrench.force_sigma),
+        list(wrench.torque_sigma),
+        wrench.taut_margin,
+        wrench.residual,
+        int(wrench.source),
+        mav.ARM_VALIDITY_FORCE | mav.ARM_VALIDITY_TORQUE if wrench.valid else 0,
+    )
+
+
+def tendon_messages(stamp: int, tendons: Sequence[TendonState], goals: Sequence[float] | None) -> Iterator[Message]:
+    """ARM_TENDONS, one for each four tendons.
+
+    Args:
+        stamp: Unix time, us.
+        tendons: state of each.
+        goals: commanded displacement of each, m.
+    """
+    for first in range(0, len(tendons), PER_MESSAGE):
+        group = tendons[first : first + PER_MESSAGE]
+        wanted = (math.nan,) * len(group) if goals is None else goals[first : first + PER_MESSAGE]
+        yield mav.MAVLink_arm_tendons_message(
+            stamp,
+            _padded([t.pull for t in group], math.nan),
+            _padded(wanted, math.nan),
+            _padded([t.tension for t in group], math.nan),
+            _padded([t.tension_sigma for t in group], math.nan),
+            _padded([_scaled(t.load, 1e3, -_INT16_MAX, _INT16_MAX) for t in group], _INT16_MAX),
+            _padded([_scaled(t.temperature, 1e2, -_INT16_MAX, _INT16_MAX) for t in group], _INT16_MAX),
+            _padded([_scaled(t.voltage, 1e3, 0, _UINT16_MAX) for t in group], _UINT16_MAX),
+            _padded([t.error_bits & _UINT8_MAX for t in group], 0),
+            first,
+            len(group),
+            sum(t.silent << i for i, t in enumerate(group)),
+            sum(t.torque << i for i, t in enumerate(group)),
+        )
+
+
+def _padded(values: Iterable[Number], filler: Number) -> list[Number]:
+    return list(itertools.islice(itertools.chain(values, itertools.repeat(filler)), PER_MESSAGE))
+
+
+def _scaled(value: float, factor: float, lower: int, upper: int) -> int:
+    """A number as the integer that goes over the wire; `upper` itself means that it is not known."""
+    if not math.isfinite(value):
+        return upper
+    return min(max(round(value * factor), lower), upper - 1)
