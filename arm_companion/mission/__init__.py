@@ -1,0 +1,1 @@
+"""What the arm and the vehicle do: pure step functions over transition tables."""

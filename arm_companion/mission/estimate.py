@@ -1,0 +1,100 @@
+"""What the sensors say of the arm's surroundings: the force on the vehicle, and the tension of the tendons.
+
+An XL430 has no current sensor, and the friction of its gears hides several newtons of tendon tension while it
+stands still. A touch of the bar is therefore looked for where it does show: in the vehicle's own motion. A
+multirotor's thrust points along its body, so its attitude says which horizontal acceleration to expect, and
+what is left over is a force from outside.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+from arm_companion.mission.facts import TendonState, VehicleState
+from arm_companion.mission.motion import rotate
+
+GRAVITY = 9.80665
+_POLE = 6.0  # rad/s, both poles of the observer
+_TARE_S = 1.0
+_TENSION_SMOOTHING_S = 0.15
+_MOVING_M_PER_S = 0.002
+
+Vec2 = tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ForceObserver:
+    """Horizontal force from outside on the vehicle, world axes (north, east).
+
+    A Luenberger observer of velocity and force with `m dv/dt = m g tan(tilt) + f`.
+
+    Attributes:
+        velocity: estimate (2,), m/s; None before the first state.
+        force: estimate (2,), N, with whatever wind and level error put on top.
+        bias: mean of `force` while the arm was certainly free (2,), N.
+        tared_s: length of that mean, s.
+        above_s: how long the residual has been above the threshold without a break, s.
+    """
+
+    velocity: Vec2 | None = None
+    force: Vec2 = (0.0, 0.0)
+    bias: Vec2 = (0.0, 0.0)
+    tared_s: float = 0.0
+    above_s: float = 0.0
+
+    @property
+    def residual(self) -> Vec2:
+        """Force beyond the bias (2,), N; zero until the bias is known."""
+        if self.tared_s < _TARE_S:
+            return (0.0, 0.0)
+        return (self.force[0] - self.bias[0], self.force[1] - self.bias[1])
+
+
+def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: float) -> ForceObserver:
+    """The observer after one cycle of `dt` seconds with a vehicle of `mass` kg."""
+    v = (vehicle.velocity_w[0], vehicle.velocity_w[1])
+    if old.velocity is None or dt <= 0.0:
+        return replace(old, velocity=v)
+    up = rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))
+    if up[2] > -0.5:  # more than 60 degrees of tilt: not a hover, and nothing can be said
+        return replace(old, velocity=v)
+    lean = (GRAVITY * up[0] / -up[2], GRAVITY * up[1] / -up[2])
+    velocity, force = [], []
+    for i in range(2):
+        miss = v[i] - old.velocity[i]
+        velocity.append(old.velocity[i] + dt * (lean[i] + old.force[i] / mass + 2.0 * _POLE * miss))
+        force.append(old.force[i] + dt * mass * _POLE * _POLE * miss)
+    return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]))
+
+
+def tare(old: ForceObserver, dt: float) -> ForceObserver:
+    """Take the present force into the bias, as long as that is still being found."""
+    if old.tared_s >= _TARE_S or dt <= 0.0:
+        return old
+    share = dt / (old.tared_s + dt)
+    bias = (
+        old.bias[0] + share * (old.force[0] - old.bias[0]),
+        old.bias[1] + share * (old.force[1] - old.bias[1]),
+    )
+    return replace(old, bias=bias, tared_s=old.tared_s + dt)
+
+
+def time_above(old: ForceObserver, direction: Vec2, threshold: float, dt: float) -> ForceObserver:
+    """Count how long the residual along `direction` (unit) has been above `threshold`, N."""
+    along = old.residual[0] * direction[0] + old.residual[1] * direction[1]
+    return replace(old, above_s=old.above_s + dt if along > threshold else 0.0)
+
+
+def smooth_tensions(old: tuple[float, ...], tendons: tuple[TendonState, ...], dt: float) -> tuple[float, ...]:
+    """Tensions (n,), N, smoothed, taken only while a servo turns: at rest its gears' friction hides them."""
+    if len(old) != len(tendons):
+        return tuple(tendon.tension for tendon in tendons)
+    share = dt / (_TENSION_SMOOTHING_S + dt)
+    return tuple(
+        before + share * (tendon.tension - before) if abs(tendon.speed) > _MOVING_M_PER_S else before
+        for before, tendon in zip(old, tendons, strict=True)
+    )
+
+
+def strength(force: Vec2) -> float:
+    """Magnitude, N."""
+    return math.hypot(*force)

@@ -1,0 +1,241 @@
+"""What the mission sees in one cycle, and what it may ask for. Plain immutable values, ready to be recorded.
+
+Frames: w world (NED), b body (FRD), a arm base. Quaternions are (w, x, y, z) and turn body into world axes.
+"""
+
+import enum
+from dataclasses import dataclass
+from typing import TypeAlias
+
+Vec3: TypeAlias = tuple[float, float, float]
+Quaternion: TypeAlias = tuple[float, float, float, float]
+
+
+class Control(enum.Enum):
+    """Who flies the vehicle, read from the autopilot's own heartbeat."""
+
+    UNKNOWN = "unknown"
+    EXTERNAL = "external"  # OFFBOARD on PX4, GUIDED on ArduPilot: our set-points count
+    PILOT = "pilot"  # any other mode: a person or the autopilot itself flies
+    FAILSAFE = "failsafe"  # the autopilot says it is in an emergency
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """Newest state of the vehicle and the age of each part (inf: never received)."""
+
+    position_w: Vec3 = (0.0, 0.0, 0.0)
+    velocity_w: Vec3 = (0.0, 0.0, 0.0)
+    attitude_wb: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    rate_b: Vec3 = (0.0, 0.0, 0.0)
+    armed: bool = False
+    landed: bool = True
+    control: Control = Control.UNKNOWN
+    mode: str = ""
+    heartbeat_age_s: float = float("inf")
+    position_age_s: float = float("inf")
+    attitude_age_s: float = float("inf")
+
+
+@dataclass(frozen=True, slots=True)
+class TendonState:
+    """One tendon as its servo reports it."""
+
+    pull: float  # m taken in, zero for the straight arm at its pretension
+    speed: float  # m/s
+    tension: float  # N, estimated from the servo's load
+    tension_sigma: float  # N
+    load: float  # share of full load, signed, positive when pulling
+    temperature: float  # degC
+    voltage: float  # V
+    error_bits: int  # hardware-error bits of the servo
+    silent: bool  # has not answered for several cycles
+    age_s: float  # since the last good reply
+    torque: bool  # torque is on
+    ready: bool = True  # it follows goals: set up, watchdog quiet, no fault, turns known
+
+
+class Order(enum.Enum):
+    """What a person can ask of the arm."""
+
+    READY = "ready"
+    STOW = "stow"
+    PERCH = "perch"
+    RELEASE = "release"
+    ABORT = "abort"
+    JOG = "jog"
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One accepted-for-consideration command; `id` ties the answer to whoever asked."""
+
+    id: int
+    order: Order
+    parameters: tuple[float, ...] = ()
+
+
+class Result(enum.Enum):
+    """Fate of a request, in MAVLink's terms."""
+
+    ACCEPTED = "accepted"
+    IN_PROGRESS = "in_progress"
+    TEMPORARILY_REJECTED = "temporarily_rejected"
+    DENIED = "denied"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What becomes of a request, with the reason in words for everything but success."""
+
+    request: int
+    result: Result
+    reason: str = ""
+    progress: int = 255  # per cent, 255: unknown
+
+
+class Severity(enum.IntEnum):
+    """Severity of a notice, MAV_SEVERITY."""
+
+    CRITICAL = 2
+    ERROR = 3
+    WARNING = 4
+    NOTICE = 5
+    INFO = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Notice:
+    """One sentence for people, sent as STATUSTEXT and logged."""
+
+    severity: Severity
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    """A bar in the world: a point on its axis, the axis' direction (unit) and its radius."""
+
+    point_w: Vec3
+    axis_w: Vec3
+    radius: float
+
+
+class ArmAction(enum.Enum):
+    """What the servos do in this cycle."""
+
+    DRIVE = "drive"  # go to the goals given
+    HOLD = "hold"  # keep the last goals
+    LIMP = "limp"  # torque off
+
+
+@dataclass(frozen=True, slots=True)
+class Setpoint:
+    """Vehicle set-point in world axes (NED), always complete: both autopilots misread partial ones."""
+
+    position_w: Vec3
+    velocity_w: Vec3
+    acceleration_w: Vec3
+    yaw: float  # rad
+
+
+class ArmFlag(enum.IntFlag):
+    """Facts that hold, bit for bit ARM_FLAG of the dialect."""
+
+    NONE = 0
+    SERVOS_CONNECTED = 1
+    TORQUE_ON = 2
+    VEHICLE_CONNECTED = 8
+    VEHICLE_STATE_FRESH = 16
+    EXTERNAL_CONTROL = 32
+    SETPOINTS_SENT = 64
+    FEEDFORWARD = 128
+    TARGET_KNOWN = 256
+    CONTACT = 512
+    ANCHORED = 1024
+
+
+class ArmFault(enum.IntFlag):
+    """Causes of failure, bit for bit ARM_ERROR of the dialect."""
+
+    NONE = 0
+    VEHICLE_LOST = 1
+    VEHICLE_STATE_STALE = 2
+    PILOT_TOOK_OVER = 8
+    AUTOPILOT_FAILSAFE = 16
+    DISARMED = 32
+    OPERATOR_ABORT = 256
+    SERVO_SILENT = 512
+    SERVO_FAULT = 1024
+    TENDON_OVER_TENSION = 32768
+    NO_CONTACT = 262144
+    SLIP = 1048576
+    GRIP_TEST_FAILED = 2097152
+    WRENCH_LIMIT = 4194304
+    TIMEOUT = 16777216
+    RESTARTED = 536870912
+
+
+class WrenchSource(enum.IntEnum):
+    """Which situation the prediction of the reaction wrench assumes."""
+
+    FREE = 0
+    CONTACT = 1
+    ANCHORED = 2
+    PAYLOAD = 3
+
+
+@dataclass(frozen=True, slots=True)
+class WrenchReport:
+    """Predicted reaction wrench of the arm on the airframe, about its centre of mass, body axes (FRD)."""
+
+    force_b: Vec3  # N
+    torque_b: Vec3  # N m
+    force_sigma: Vec3  # N, one sigma
+    torque_sigma: Vec3  # N m, one sigma
+    source: WrenchSource
+    valid: bool
+    taut_margin: float  # m the base may still move away before the arm goes taut; nan: does not apply
+    residual: float  # of the model's equilibrium, relative; nan: none was solved
+
+
+@dataclass(frozen=True, slots=True)
+class StatusReport:
+    """What the arm is doing, for ARM_STATUS."""
+
+    behaviour: str  # "stowed", "ready", "perch", ...
+    state: str  # name of the machine's state
+    state_number: int
+    progress: int  # per cent, 255: unknown
+    flags: ArmFlag
+    error_bits: ArmFault
+    theta: float  # rad
+    delta: float  # rad
+    tip_position_a: Vec3  # m, base axes
+    goal_theta: float  # rad
+    goal_delta: float  # rad
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """Everything that one step sees: the world as known at this cycle, with the age of each part."""
+
+    vehicle: VehicleState
+    tendons: tuple[TendonState, ...]
+    requests: tuple[Request, ...] = ()
+    bar: Bar | None = None  # newest target
+
+
+@dataclass(frozen=True, slots=True)
+class Commands:
+    """Everything that one step asks for."""
+
+    arm: ArmAction
+    pulls: tuple[float, ...] | None  # m, goal of each tendon; None with HOLD and LIMP
+    setpoint: Setpoint | None  # None: send none, the pilot has the vehicle
+    answers: tuple[Answer, ...]
+    notices: tuple[Notice, ...]
+    status: StatusReport
+    wrench: WrenchReport

@@ -1,0 +1,194 @@
+"""The mission's step: a pure function from memory and facts to memory and commands."""
+
+import dataclasses
+import math
+
+from arm_companion.errors import CommandRejected
+from arm_companion.mission import actions
+from arm_companion.mission.estimate import observe_force, smooth_tensions, tare, time_above
+from arm_companion.mission.facts import (
+    Answer,
+    ArmAction,
+    ArmFault,
+    Commands,
+    Facts,
+    Notice,
+    Order,
+    Request,
+    Result,
+    Severity,
+)
+from arm_companion.mission.perch import TABLE, TENSE
+from arm_companion.mission.report import status_report
+from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.state import Phase, Running, State
+from arm_companion.mission.wrench import predict
+
+_JOG_BEND = 1
+_JOG_VEHICLE = 3
+
+SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
+"""What the servos do in each phase when the cycle itself fails or the daemon is told to stop.
+
+An anchored arm must not let go by itself, a free one must not move by itself: each keeps its goals. Torque is
+never cut here, because a phase in which a limp arm is safe (stowed, on the ground) is also safe with torque on.
+"""
+
+
+def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[State, Commands]:
+    """One cycle: orders, then transitions, then the phase's action.
+
+    Args:
+        state: memory after the previous step.
+        facts: the world as known now.
+        t: loop time, s.
+        parameters: configuration and arm model.
+
+    Returns:
+        Memory after this step and everything that it asks for.
+    """
+    answers: list[Answer] = []
+    notices: list[Notice] = []
+    situation = Situation(state, facts, t, parameters)
+    situation = situation.remembering(_estimate(situation))
+    situation = _yield_to_pilot(situation, notices)
+    for request in facts.requests:
+        situation = _obey(situation, request, answers, notices)
+    situation = _move_on(situation, answers, notices)
+    state, arm, pulls = actions.act(situation)
+    situation = situation.remembering(state)
+    prediction = predict(situation)
+    state = dataclasses.replace(
+        state,
+        t=t,
+        prediction=prediction,
+        control=facts.vehicle.control,
+        warned=_warn(situation, notices),
+    )
+    commands = Commands(
+        arm,
+        pulls,
+        actions.setpoint(situation),
+        tuple(answers),
+        tuple(notices),
+        status_report(situation, prediction.tip_a),
+        prediction.wrench,
+    )
+    return state, commands
+
+
+def _estimate(s: Situation) -> State:
+    """The observers after this cycle."""
+    state, perch = s.state, s.config.perch
+    force = (
+        observe_force(state.force, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt) if s.vehicle_fresh else state.force
+    )
+    if state.phase is Phase.REACH:
+        # the bar pushes the arm, and with it the vehicle, back
+        force = time_above(tare(force, s.dt), (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
+    return dataclasses.replace(state, force=force, tension=smooth_tensions(state.tension, s.facts.tendons, s.dt))
+
+
+def _yield_to_pilot(s: Situation, notices: list[Notice]) -> Situation:
+    """Stop the set-points in the very cycle in which the autopilot leaves our mode."""
+    if not (s.pilot_took_over and s.state.streaming):
+        return s
+    notices.append(Notice(Severity.NOTICE, f"set-points stopped: mode {s.facts.vehicle.mode}"))
+    return s.remembering(dataclasses.replace(s.state, streaming=False, reference=None))
+
+
+def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[Notice]) -> Situation:
+    """Carry out one order, or reject it and change nothing."""
+    name, phase = request.order.name, s.state.phase
+    try:
+        row = TABLE.order(request.order, phase)
+        if row is None:
+            raise CommandRejected(f"{name} is not possible in state {phase.name}")
+        if (reason := row.refusal(s)) is not None:
+            raise CommandRejected(reason)
+        jogged = _jog(s, request) if request.order is Order.JOG else s.state
+    except CommandRejected as rejected:
+        again_later = TABLE.known(request.order)
+        result = Result.TEMPORARILY_REJECTED if again_later else Result.DENIED
+        answers.append(Answer(request.id, result, rejected.reason))
+        notices.append(Notice(Severity.WARNING, f"{name} rejected: {rejected.reason}"))
+        return s
+    s = s.remembering(jogged)
+    if s.state.running is not None and request.order is not Order.JOG:
+        answers.append(Answer(s.state.running.request, Result.CANCELLED, f"{name} ordered"))
+        s = s.remembering(dataclasses.replace(s.state, running=None))
+    if request.order is Order.READY:
+        s = s.remembering(dataclasses.replace(s.state, streaming=True, errors=ArmFault.NONE))
+    if request.order is Order.PERCH:
+        s = s.remembering(dataclasses.replace(s.state, errors=ArmFault.NONE))
+    if row.target is not phase:
+        aborted = ArmFault.OPERATOR_ABORT if request.order is Order.ABORT else ArmFault.NONE
+        s = _enter(s, row.target, f"order {name}", notices, aborted)
+    if s.state.phase in row.done:
+        answers.append(Answer(request.id, Result.ACCEPTED, progress=100))
+        return s
+    answers.append(Answer(request.id, Result.IN_PROGRESS, progress=0))
+    return s.remembering(dataclasses.replace(s.state, running=Running(request.id, request.order, row.done)))
+
+
+def _jog(s: Situation, request: Request) -> State:
+    """The state with a jog's new goal.
+
+    Raises:
+        CommandRejected: kind, value or size does not fit.
+    """
+    kind, x, y, z = (*request.parameters, 0.0, 0.0, 0.0, 0.0)[:4]
+    if s.state.phase is Phase.PERCHED and kind == _JOG_VEHICLE:
+        if (size := math.hypot(x, y, z)) > s.config.perch.jog_max_m:
+            raise CommandRejected(f"a move of {size:.3f} m is over {s.config.perch.jog_max_m:g} m")
+        return dataclasses.replace(s.state, offset=(x, y, z))
+    if s.state.phase is Phase.READY and kind == _JOG_BEND:
+        theta, delta = x, y
+        if abs(theta) > s.config.limits.bend_max_rad:
+            raise CommandRejected(f"a bend of {theta:.2f} rad is over {s.config.limits.bend_max_rad:g} rad")
+        return dataclasses.replace(s.state, bend_goal=(theta * math.cos(delta), theta * math.sin(delta)))
+    raise CommandRejected(f"jog kind {kind:g} is not possible in state {s.state.phase.name}")
+
+
+def _move_on(s: Situation, answers: list[Answer], notices: list[Notice]) -> Situation:
+    """Apply the first row that fires, and tell whoever waits for the outcome."""
+    fired = TABLE.next(s.state.phase, s)
+    if fired is None:
+        return s
+    row, reason = fired
+    s = _enter(s, row.target, reason, notices, row.error)
+    running = s.state.running
+    if running is None:
+        return s
+    if row.fails:
+        answers.append(Answer(running.request, Result.FAILED, reason))
+    elif s.state.phase in running.done:
+        answers.append(Answer(running.request, Result.ACCEPTED, progress=100))
+    else:
+        answers.append(Answer(running.request, Result.IN_PROGRESS, reason, actions.progress(s)))
+        return s
+    return s.remembering(dataclasses.replace(s.state, running=None))
+
+
+def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error: ArmFault) -> Situation:
+    """Change the phase: one notice with its cause, and the phase's own preparations."""
+    severity = Severity.WARNING if error else Severity.INFO
+    notices.append(Notice(severity, f"{s.state.phase.name} -> {phase.name}: {reason}"))
+    state = dataclasses.replace(
+        s.state,
+        phase=phase,
+        since=s.t,
+        errors=s.state.errors | error,
+        warned=frozenset(),
+    )
+    return s.remembering(actions.prepare(s.remembering(state)))
+
+
+def _warn(s: Situation, notices: list[Notice]) -> frozenset[str]:
+    """Say once per phase what a person must know and no transition tells."""
+    warned = s.state.warned
+    fault = s.servo_fault
+    if fault is not None and s.state.phase in TENSE and fault not in warned:
+        notices.append(Notice(Severity.CRITICAL, f"{fault}; the arm holds"))
+        warned |= {fault}
+    return warned

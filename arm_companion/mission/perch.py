@@ -1,0 +1,348 @@
+"""The anchor perch as a table: an arm below wraps a bar and holds, while the vehicle goes on flying.
+
+Abort rows stand first and therefore win. A row's guard returns its reason in words.
+"""
+
+from arm_companion.mission.estimate import strength
+from arm_companion.mission.facts import ArmFault, Control, Order
+from arm_companion.mission.machine import OrderRow, Table, Transition
+from arm_companion.mission.motion import arrived, dot, norm, scale, sub
+from arm_companion.mission.situation import Situation, at
+from arm_companion.mission.state import Phase
+
+Row = Transition[Phase, Situation]
+
+FREE_FLIGHT = frozenset({Phase.APPROACH, Phase.REACH})
+GRASPING = frozenset({Phase.CONTACT, Phase.WRAP})
+GRIPPED = frozenset({Phase.VERIFY, Phase.PERCHED})
+LEAVING = frozenset({Phase.UNLOAD, Phase.RELEASE, Phase.DEPART})
+FLYING = FREE_FLIGHT | GRASPING | GRIPPED | LEAVING
+TENSE = GRASPING | GRIPPED | frozenset({Phase.UNLOAD, Phase.HOLDING})
+"""Phases in which the arm may be carrying a load."""
+
+_AT_STANDOFF_M = 0.06
+_CONTACT_PERSISTS_S = 0.15
+_SETTLE_S = 1.0
+_PROBE_S = 3.0
+_POSE_CHECKED_RAD = 0.15
+_ADOPT_BEND_RAD = 0.3
+_SLIP_M = 0.12
+_CLEAR_BEND_RAD = 0.25
+_READYING_S = 10.0
+_BAR_WITHIN_M = 50.0
+_BAR_LEVEL = 0.2  # sine of the steepest bar that an upright vehicle can wrap
+
+
+# --- guards: what can go wrong ---
+
+
+def pilot_takes_over(s: Situation) -> str | None:
+    """The autopilot left our mode: whoever did it, the vehicle is theirs."""
+    return f"the pilot has the vehicle (mode {s.facts.vehicle.mode})" if not s.external else None
+
+
+def failsafe(s: Situation) -> str | None:
+    """The autopilot declares an emergency."""
+    return "autopilot failsafe" if s.facts.vehicle.control is Control.FAILSAFE else None
+
+
+def disarmed(s: Situation) -> str | None:
+    """The motors stopped."""
+    return "the vehicle is disarmed" if not s.facts.vehicle.armed else None
+
+
+def vehicle_lost(s: Situation) -> str | None:
+    """State or heartbeat of the vehicle is too old."""
+    v = s.facts.vehicle
+    if s.vehicle_fresh:
+        return None
+    age = max(v.position_age_s, v.attitude_age_s)
+    return f"vehicle state is {age:.2f} s old, heartbeat {v.heartbeat_age_s:.1f} s"
+
+
+def servo_fault(s: Situation) -> str | None:
+    """A servo is silent or reports a hardware error."""
+    return s.servo_fault
+
+
+def _too_long(limit_s: float, what: str, s: Situation) -> str | None:
+    return f"{what} took more than {limit_s:g} s" if s.elapsed > limit_s else None
+
+
+def state_timeout(s: Situation) -> str | None:
+    """A moving phase lasts longer than allowed."""
+    return _too_long(s.config.perch.state_timeout_s, s.state.phase.name.lower(), s)
+
+
+def no_contact(s: Situation) -> str | None:
+    """The reach ended, or took too long, without the bar."""
+    perch = s.config.perch
+    if (late := _too_long(perch.contact_timeout_s, "reach without contact", s)) is not None:
+        return late
+    reference = s.state.reference
+    end = s.place(-perch.overreach_m)
+    if reference is not None and arrived(reference, end) and at(s, end, 0.05):
+        return f"no contact {perch.overreach_m * 100:.0f} cm past where the bar should be"
+    return None
+
+
+def no_grip(s: Situation) -> str | None:
+    """The arm is wrapped as far as allowed, yet no tendon carries a grip's tension."""
+    if not wrapped(s) or s.elapsed < s.config.perch.wrap_bend_rad / s.config.perch.bend_speed_rad_per_s + _SETTLE_S:
+        return None
+    if gripped(s) is not None:
+        return None
+    return f"no grip: {max(s.state.tension):.1f} N at full wrap, {s.config.perch.grip_tension_n:g} N are needed"
+
+
+def pull_test_failed(s: Situation) -> str | None:
+    """The pull test moved the vehicle as if nothing held it."""
+    share = pull_test_share(s)
+    if s.elapsed < _PROBE_S or share < s.config.perch.verify_give_share:
+        return None
+    return f"pull test failed: gave {share:.0%} of the asked move"
+
+
+def grip_lost(s: Situation) -> str | None:
+    """The vehicle is far from where the grip would have kept it."""
+    return f"grip lost: vehicle moved {s.slipped:.2f} m" if s.slipped > _SLIP_M else None
+
+
+def overstressed(s: Situation) -> str | None:
+    """A tendon carries more than its limit."""
+    most, limit = max(s.tensions), s.config.limits.tension_max_n
+    return f"tendon tension {most:.1f} N is over {limit:g} N" if most > limit else None
+
+
+# --- guards: what goes well ---
+
+
+def straight_at_start(s: Situation) -> str | None:
+    """The daemon finds the arm straight or slack: nothing depends on it."""
+    if not s.facts.tendons or any(tendon.silent for tendon in s.facts.tendons):
+        return None
+    limp = not any(tendon.torque for tendon in s.facts.tendons)
+    small = norm((*s.bend, 0.0)) < _ADOPT_BEND_RAD
+    return "arm found at rest" if limp or small else None
+
+
+def bent_at_start(s: Situation) -> str | None:
+    """The daemon finds the arm bent under torque: someone depends on it, so it is left as it is."""
+    if not s.facts.tendons or any(tendon.silent for tendon in s.facts.tendons):
+        return None
+    return "arm found bent and holding; it is left as it is"
+
+
+def pose_checked(s: Situation) -> str | None:
+    """The arm stands where it was told to, with torque on."""
+    ok = (
+        s.elapsed > _SETTLE_S
+        and all(tendon.torque for tendon in s.facts.tendons)
+        and s.state.bend == s.state.bend_goal
+        and s.bend_error < _POSE_CHECKED_RAD
+    )
+    return "pose checked" if ok else None
+
+
+def pose_check_failed(s: Situation) -> str | None:
+    """The arm does not reach its ready pose."""
+    if s.elapsed < _READYING_S:
+        return None
+    if not all(tendon.torque for tendon in s.facts.tendons):
+        return "servo torque does not come on"
+    return f"arm is {s.bend_error:.2f} rad away from its ready pose"
+
+
+def at_standoff(s: Situation) -> str | None:
+    """The vehicle rests at the stand-off, facing the bar."""
+    goal = s.place(s.config.perch.standoff_m)
+    reference = s.state.reference
+    ok = reference is not None and arrived(reference, goal) and at(s, goal, _AT_STANDOFF_M)
+    return "at the stand-off" if ok else None
+
+
+def contact_found(s: Situation) -> str | None:
+    """Something pushes the vehicle back, and goes on doing so, that the free arm does not explain."""
+    if s.state.force.above_s < _CONTACT_PERSISTS_S:
+        return None
+    return f"contact: {strength(s.state.force.residual):.1f} N beyond what the free arm explains"
+
+
+def contact_settled(s: Situation) -> str | None:
+    """The vehicle has stopped at the bar."""
+    return "settled at the bar" if s.elapsed > _SETTLE_S else None
+
+
+def wrapped(s: Situation) -> bool:
+    """Whether the commanded bend has reached the full wrap."""
+    return s.state.bend == s.state.bend_goal
+
+
+def gripped(s: Situation) -> str | None:
+    """Some tendon carries the grip tension with the wrap complete."""
+    most = max(s.state.tension)
+    return f"gripped with {most:.1f} N" if wrapped(s) and most >= s.config.perch.grip_tension_n else None
+
+
+def pull_test_share(s: Situation) -> float:
+    """Share of the asked move that the pull test's vehicle made, away from the bar."""
+    asked = s.config.perch.verify_pull_m
+    back = scale(s.ahead, -1.0)
+    return dot(sub(s.facts.vehicle.position_w, s.probe), back) / asked
+
+
+def pull_test_passed(s: Situation) -> str | None:
+    """The grip gave less than the allowed share."""
+    share = pull_test_share(s)
+    if s.elapsed < _PROBE_S or share >= s.config.perch.verify_give_share:
+        return None
+    return f"pull test passed: gave {share:.0%} of the asked move"
+
+
+def unloaded(s: Situation) -> str | None:
+    """The reference is back at the anchor, so that letting go does not kick."""
+    return "unloaded" if s.elapsed > _SETTLE_S and norm(s.state.offset) == 0.0 else None
+
+
+def unwrapped(s: Situation) -> str | None:
+    """The arm is straight enough to leave."""
+    ok = s.state.bend == s.state.bend_goal and norm((*s.bend, 0.0)) < _CLEAR_BEND_RAD
+    return "arm clear of the bar" if ok else None
+
+
+def cannot_depart(s: Situation) -> str | None:
+    """The arm is clear but the vehicle is not ours to move."""
+    return "arm clear; the vehicle is not ours to move" if unwrapped(s) and not s.external else None
+
+
+# --- orders: what a person may ask, and when ---
+
+
+def cannot_ready(s: Situation) -> str | None:
+    """Why the arm cannot be made ready now."""
+    return s.servo_fault
+
+
+def cannot_perch(s: Situation) -> str | None:
+    """Why a perch cannot begin now."""
+    vehicle = s.facts.vehicle
+    if (lost := vehicle_lost(s)) is not None:
+        return lost
+    if not vehicle.armed or vehicle.landed:
+        return "the vehicle is not flying"
+    if not s.external:
+        return f"the autopilot is in {vehicle.mode or 'an unknown mode'}: switch it to external set-points first"
+    if (distance := norm(sub(s.bar.point_w, vehicle.position_w))) > _BAR_WITHIN_M:
+        return f"the bar is {distance:.0f} m away; at most {_BAR_WITHIN_M:g} m are allowed"
+    if abs(s.bar.axis_w[2]) > _BAR_LEVEL:
+        return "the bar is not level"
+    return None
+
+
+def cannot_jog_vehicle(s: Situation) -> str | None:
+    """Why the anchored vehicle cannot be moved now."""
+    return None if s.external else "the vehicle is not ours to move"
+
+
+Ask = OrderRow[Phase, Situation]
+STOWED_ONLY = frozenset({Phase.STOWED})
+
+ORDERS: tuple[Ask, ...] = (
+    Ask(
+        Order.READY,
+        frozenset({Phase.STOWED, Phase.STOWING}),
+        Phase.READYING,
+        frozenset({Phase.READY}),
+        cannot_ready,
+    ),
+    Ask(Order.READY, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY}), cannot_ready),
+    Ask(Order.PERCH, frozenset({Phase.READY}), Phase.APPROACH, frozenset({Phase.PERCHED}), cannot_perch),
+    Ask(Order.JOG, frozenset({Phase.PERCHED}), Phase.PERCHED, frozenset({Phase.PERCHED}), cannot_jog_vehicle),
+    Ask(Order.JOG, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY})),
+    Ask(Order.RELEASE, GRASPING | GRIPPED, Phase.UNLOAD, STOWED_ONLY),
+    Ask(Order.RELEASE, frozenset({Phase.HOLDING}), Phase.RELEASE, STOWED_ONLY),
+    Ask(Order.STOW, FREE_FLIGHT, Phase.DEPART, STOWED_ONLY),
+    Ask(Order.STOW, frozenset({Phase.READYING, Phase.READY, Phase.STOWING}), Phase.STOWING, STOWED_ONLY),
+    Ask(Order.STOW, STOWED_ONLY, Phase.STOWED, STOWED_ONLY),
+    Ask(Order.ABORT, FREE_FLIGHT, Phase.DEPART, frozenset({Phase.DEPART})),
+    Ask(Order.ABORT, GRASPING | GRIPPED, Phase.UNLOAD, frozenset({Phase.UNLOAD})),
+    Ask(Order.ABORT, frozenset({Phase.READYING, Phase.READY}), Phase.STOWING, frozenset({Phase.STOWING})),
+    *(
+        # nothing is under way that could be given up, or it is being given up already
+        Ask(Order.ABORT, frozenset({phase}), phase, frozenset({phase}))
+        for phase in (
+            *sorted(LEAVING, key=lambda p: p.value),
+            Phase.STOWING,
+            Phase.HOLDING,
+            Phase.STOWED,
+            Phase.STARTUP,
+        )
+    ),
+)
+
+TABLE: Table[Phase, Situation] = Table(
+    transitions=(
+        # aborts
+        Row(
+            FREE_FLIGHT | {Phase.DEPART},
+            pilot_takes_over,
+            Phase.STOWING,
+            "pilot takes over",
+            ArmFault.PILOT_TOOK_OVER,
+        ),
+        Row(GRASPING, pilot_takes_over, Phase.RELEASE, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
+        Row(GRIPPED, pilot_takes_over, Phase.HOLDING, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
+        Row(FREE_FLIGHT | {Phase.DEPART}, vehicle_lost, Phase.STOWING, "vehicle lost", ArmFault.VEHICLE_LOST),
+        Row(GRASPING, vehicle_lost, Phase.RELEASE, "vehicle lost", ArmFault.VEHICLE_LOST),
+        Row(GRIPPED, vehicle_lost, Phase.HOLDING, "vehicle lost", ArmFault.VEHICLE_LOST),
+        Row(FREE_FLIGHT, servo_fault, Phase.DEPART, "servo fault", ArmFault.SERVO_FAULT),
+        Row(GRASPING | {Phase.VERIFY}, servo_fault, Phase.UNLOAD, "servo fault", ArmFault.SERVO_FAULT),
+        Row(
+            frozenset({Phase.READYING, Phase.READY}),
+            servo_fault,
+            Phase.STOWING,
+            "servo fault",
+            ArmFault.SERVO_FAULT,
+        ),
+        Row(GRASPING | GRIPPED, overstressed, Phase.UNLOAD, "over-tension", ArmFault.TENDON_OVER_TENSION),
+        Row(frozenset({Phase.PERCHED}), grip_lost, Phase.UNLOAD, "grip lost", ArmFault.SLIP),
+        Row(
+            frozenset({Phase.READYING}),
+            pose_check_failed,
+            Phase.STOWING,
+            "pose check failed",
+            ArmFault.TIMEOUT,
+        ),
+        # progress
+        Row(frozenset({Phase.STARTUP}), straight_at_start, Phase.STOWED, "arm at rest"),
+        Row(frozenset({Phase.STARTUP}), bent_at_start, Phase.HOLDING, "arm holds something"),
+        Row(frozenset({Phase.READYING}), pose_checked, Phase.READY, "pose checked"),
+        Row(frozenset({Phase.APPROACH}), at_standoff, Phase.REACH, "at stand-off"),
+        Row(frozenset({Phase.REACH}), contact_found, Phase.CONTACT, "contact found"),
+        Row(frozenset({Phase.REACH}), no_contact, Phase.DEPART, "no contact", ArmFault.NO_CONTACT),
+        Row(frozenset({Phase.CONTACT}), contact_settled, Phase.WRAP, "settled"),
+        Row(frozenset({Phase.WRAP}), gripped, Phase.VERIFY, "grip tension"),
+        Row(frozenset({Phase.WRAP}), no_grip, Phase.UNLOAD, "no grip", ArmFault.GRIP_TEST_FAILED),
+        Row(frozenset({Phase.VERIFY}), pull_test_passed, Phase.PERCHED, "pull test passed"),
+        Row(
+            frozenset({Phase.VERIFY}),
+            pull_test_failed,
+            Phase.UNLOAD,
+            "pull test failed",
+            ArmFault.GRIP_TEST_FAILED,
+        ),
+        Row(frozenset({Phase.UNLOAD}), unloaded, Phase.RELEASE, "unloaded"),
+        Row(frozenset({Phase.RELEASE}), cannot_depart, Phase.STOWING, "vehicle not ours"),
+        Row(frozenset({Phase.RELEASE}), unwrapped, Phase.DEPART, "arm clear"),
+        Row(frozenset({Phase.DEPART}), at_standoff, Phase.STOWING, "at stand-off"),
+        Row(frozenset({Phase.STOWING}), pose_checked, Phase.STOWED, "arm straight"),
+        # time limits last: progress in the same cycle wins
+        Row(frozenset({Phase.APPROACH}), state_timeout, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
+        Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.RELEASE}), state_timeout, Phase.HOLDING, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.DEPART}), state_timeout, Phase.STOWING, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.STOWING}), state_timeout, Phase.HOLDING, "time limit", ArmFault.TIMEOUT),
+    ),
+    orders=ORDERS,
+)

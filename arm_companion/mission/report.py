@@ -1,0 +1,74 @@
+"""What the arm is doing, for telemetry."""
+
+import math
+
+from arm_companion.mission import actions
+from arm_companion.mission.facts import ArmFault, ArmFlag, Control, StatusReport, Vec3
+from arm_companion.mission.motion import ZERO
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import Phase
+
+_BEHAVIOUR = {
+    Phase.STARTUP: "startup",
+    Phase.STOWED: "stowed",
+    Phase.READYING: "ready",
+    Phase.READY: "ready",
+    Phase.STOWING: "stow",
+    Phase.HOLDING: "hold",
+}
+
+
+def status_report(s: Situation, tip_a: Vec3) -> StatusReport:
+    """ARM_STATUS of this cycle."""
+    theta, delta = _polar(s.bend)
+    goal_theta, goal_delta = _polar(s.state.bend)
+    return StatusReport(
+        behaviour=_BEHAVIOUR.get(s.state.phase, "perch"),
+        state=s.state.phase.name,
+        state_number=s.state.phase.value,
+        progress=actions.progress(s) if s.state.running else 255,
+        flags=_flags(s),
+        error_bits=s.state.errors | _present_faults(s),
+        theta=theta,
+        delta=delta,
+        tip_position_a=tip_a,
+        goal_theta=goal_theta,
+        goal_delta=goal_delta,
+    )
+
+
+def _flags(s: Situation) -> ArmFlag:
+    """Facts that hold now."""
+    vehicle, tendons, state = s.facts.vehicle, s.facts.tendons, s.state
+    held = {
+        ArmFlag.SERVOS_CONNECTED: bool(tendons) and not any(tendon.silent for tendon in tendons),
+        ArmFlag.TORQUE_ON: bool(tendons) and all(tendon.torque for tendon in tendons),
+        ArmFlag.VEHICLE_CONNECTED: vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s,
+        ArmFlag.VEHICLE_STATE_FRESH: s.vehicle_fresh,
+        ArmFlag.EXTERNAL_CONTROL: s.external,
+        ArmFlag.SETPOINTS_SENT: state.streaming and state.reference is not None and vehicle.armed,
+        ArmFlag.FEEDFORWARD: state.phase is Phase.PERCHED and state.offset != ZERO,
+        ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
+        ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
+        ArmFlag.ANCHORED: state.phase is Phase.PERCHED,
+    }
+    return ArmFlag(sum(flag for flag, holds in held.items() if holds))
+
+
+def _present_faults(s: Situation) -> ArmFault:
+    """Causes of failure that are there now, whether or not a row has acted on them."""
+    vehicle, tendons = s.facts.vehicle, s.facts.tendons
+    there = {
+        ArmFault.VEHICLE_LOST: vehicle.heartbeat_age_s > s.config.vehicle.heartbeat_timeout_s,
+        ArmFault.VEHICLE_STATE_STALE: not s.vehicle_fresh,
+        ArmFault.AUTOPILOT_FAILSAFE: vehicle.control is Control.FAILSAFE,
+        ArmFault.SERVO_SILENT: any(tendon.silent for tendon in tendons),
+        ArmFault.SERVO_FAULT: any(tendon.error_bits for tendon in tendons),
+        ArmFault.TENDON_OVER_TENSION: any(t.tension > s.config.limits.tension_max_n for t in tendons),
+    }
+    return ArmFault(sum(fault for fault, present in there.items() if present))
+
+
+def _polar(u: tuple[float, float]) -> tuple[float, float]:
+    theta = math.hypot(*u)
+    return theta, math.atan2(u[1], u[0]) if theta > 0.0 else 0.0

@@ -1,0 +1,216 @@
+"""One cycle as the guards and actions see it: facts, memory, parameters and what follows from them."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from arm_companion.arm.model import ArmModel, ArmSolution
+from arm_companion.arm.reaction import GRAVITY, mount
+from arm_companion.config.schema import Config
+from arm_companion.errors import ModelError
+from arm_companion.geometry.arrays import Array
+from arm_companion.geometry.se3 import Pose
+from arm_companion.mission.facts import Bar, Control, Facts, Vec3
+from arm_companion.mission.motion import dot, norm, scale, sub, turn_by_yaw, unrotate
+from arm_companion.mission.state import State
+
+_FROM_FACTS = frozenset({"gravity_a", "mount", "bend", "free_arm"})
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """What does not change in flight."""
+
+    config: Config
+    model: ArmModel
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Facts, memory and parameters of one cycle."""
+
+    state: State
+    facts: Facts
+    t: float
+    parameters: Parameters
+
+    def remembering(self, state: State) -> "Situation":
+        """The same cycle with other memory; what follows from the facts alone is not computed again."""
+        other = dataclasses.replace(self, state=state)
+        for name in _FROM_FACTS & self.__dict__.keys():
+            other.__dict__[name] = self.__dict__[name]
+        return other
+
+    @property
+    def config(self) -> Config:
+        """The whole configuration."""
+        return self.parameters.config
+
+    @property
+    def dt(self) -> float:
+        """Seconds since the previous step, at most a tenth: a stall must not become a leap."""
+        return min(max(self.t - self.state.t, 0.0), 0.1) if self.state.t else 0.0
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds in the present phase."""
+        return self.t - self.state.since
+
+    # --- the vehicle ---
+
+    @property
+    def vehicle_fresh(self) -> bool:
+        """Whether position and attitude are new enough to act on."""
+        v = self.facts.vehicle
+        limit = self.config.vehicle.state_timeout_s
+        return (
+            v.position_age_s <= limit
+            and v.attitude_age_s <= limit
+            and v.heartbeat_age_s <= self.config.vehicle.heartbeat_timeout_s
+        )
+
+    @property
+    def external(self) -> bool:
+        """Whether our set-points fly the vehicle."""
+        return self.facts.vehicle.control is Control.EXTERNAL
+
+    @property
+    def pilot_took_over(self) -> bool:
+        """Whether the autopilot left our mode since the previous step, whoever made it."""
+        return self.state.control is Control.EXTERNAL and not self.external
+
+    @cached_property
+    def mount(self) -> Pose:
+        """T_ba: the arm's base on the airframe."""
+        return mount(self.config.mount.position_m, self.config.mount.rpy_deg)
+
+    @cached_property
+    def gravity_a(self) -> Vec3:
+        """Gravity in the arm's base axes, m/s^2."""
+        down_b = unrotate(self.facts.vehicle.attitude_wb, (0.0, 0.0, GRAVITY))
+        x, y, z = (float(g) for g in self.mount.rotation.T @ np.asarray(down_b))
+        return x, y, z
+
+    # --- the arm ---
+
+    @property
+    def pulls(self) -> tuple[float, ...]:
+        """Measured tendon displacements, m."""
+        return tuple(tendon.pull for tendon in self.facts.tendons)
+
+    @property
+    def tensions(self) -> tuple[float, ...]:
+        """Estimated tendon tensions, N."""
+        return tuple(tendon.tension for tendon in self.facts.tendons)
+
+    @property
+    def servo_fault(self) -> str | None:
+        """The first servo fault in words."""
+        for i, tendon in enumerate(self.facts.tendons):
+            if tendon.error_bits:
+                return f"tendon {i + 1}: servo hardware error 0x{tendon.error_bits:02x}"
+            if tendon.silent:
+                return f"tendon {i + 1}: servo does not answer"
+        return None
+
+    @cached_property
+    def bend(self) -> tuple[float, float]:
+        """Bend that the measured displacements stand for, rad."""
+        u = self.parameters.model.bend_for_pull(np.asarray(self.pulls))
+        return float(u[0]), float(u[1])
+
+    @property
+    def bend_error(self) -> float:
+        """Distance between commanded and measured bend, rad."""
+        return math.hypot(self.bend[0] - self.state.bend[0], self.bend[1] - self.state.bend[1])
+
+    @cached_property
+    def free_arm(self) -> ArmSolution | None:
+        """The arm as it would hang with nothing at its tip; None without a solution."""
+        try:
+            return self.parameters.model.free(np.asarray(self.pulls), np.asarray(self.gravity_a))
+        except ModelError:
+            return None
+
+    # --- the bar ---
+
+    @property
+    def bar(self) -> Bar:
+        """The target: the newest one received, else the configuration's."""
+        if self.facts.bar is not None:
+            return self.facts.bar
+        perch = self.config.perch
+        heading = math.radians(perch.bar_axis_deg)
+        x, y, z = perch.bar_position_m
+        return Bar((x, y, z), (math.cos(heading), math.sin(heading), 0.0), perch.bar_radius_m)
+
+    def base_offset_w(self, yaw: float) -> Vec3:
+        """From the vehicle's centre of mass to the arm's base while it hovers at `yaw`, world axes."""
+        x, y, z = self.config.mount.position_m
+        return turn_by_yaw((x, y, z), yaw)
+
+    def place(self, before_contact: float) -> Vec3:
+        """Vehicle position at which the straight arm is `before_contact` metres short of touching the bar.
+
+        The arm hangs so that the bar meets it at the configured arc length.
+        """
+        bar = self.bar
+        perch = self.config.perch
+        yaw = self.state.heading
+        back = before_contact + bar.radius + perch.disk_radius_m
+        base = sub(bar.point_w, scale(self.ahead, back))
+        # the straight arm points along +z of its base: down when it is mounted below
+        straight = turn_by_yaw(_column(self.mount.rotation, 2), yaw)
+        base = sub(base, scale(straight, perch.contact_arc_m))
+        return sub(base, self.base_offset_w(yaw))
+
+    @property
+    def ahead(self) -> Vec3:
+        """Horizontal unit vector from the stand-off towards the bar."""
+        return (math.cos(self.state.heading), math.sin(self.state.heading), 0.0)
+
+    @property
+    def towards_bar_a(self) -> tuple[float, float]:
+        """Direction of bending, base axes, in which a vehicle that faces the bar wraps it."""
+        x, y, _ = _column(self.mount.rotation.T, 0)  # forward in base axes
+        length = math.hypot(x, y)
+        return (x / length, y / length) if length > 0.0 else (1.0, 0.0)
+
+    @property
+    def probe(self) -> Vec3:
+        """Vehicle position when the pull test began."""
+        return self.state.anchor.position_w if self.state.anchor else self.facts.vehicle.position_w
+
+    def heading_to_bar(self) -> float:
+        """Heading across the bar's axis, on the side on which the vehicle is now, rad."""
+        bar = self.bar
+        across: Vec3 = (-bar.axis_w[1], bar.axis_w[0], 0.0)
+        towards = sub(bar.point_w, self.facts.vehicle.position_w)
+        if dot(across, towards) < 0.0:
+            across = scale(across, -1.0)
+        return math.atan2(across[1], across[0])
+
+    @property
+    def moved(self) -> Vec3:
+        """Vehicle displacement since the anchor was set, m, world axes."""
+        if self.state.anchor is None:
+            return (0.0, 0.0, 0.0)
+        return sub(self.facts.vehicle.position_w, self.state.anchor.position_w)
+
+    @property
+    def slipped(self) -> float:
+        """How far the anchored vehicle is from where it was asked to be, m."""
+        return norm(sub(self.moved, self.state.offset))
+
+
+def _column(matrix: Array, j: int) -> Vec3:
+    return float(matrix[0, j]), float(matrix[1, j]), float(matrix[2, j])
+
+
+def at(s: Situation, goal: Vec3, tolerance: float) -> bool:
+    """Whether the vehicle itself is within `tolerance` metres of `goal` and slow."""
+    vehicle = s.facts.vehicle
+    return norm(sub(vehicle.position_w, goal)) <= tolerance and norm(vehicle.velocity_w) <= tolerance

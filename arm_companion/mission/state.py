@@ -1,0 +1,92 @@
+"""What the mission remembers from one cycle to the next."""
+
+import enum
+from dataclasses import dataclass
+
+from arm_companion.mission.estimate import ForceObserver
+from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, Vec3, WrenchReport
+from arm_companion.mission.motion import ZERO, Reference
+
+
+class Phase(enum.Enum):
+    """States of the anchor perch, in the order of a flight; the value is the number of ARM_STATE."""
+
+    STARTUP = 0
+    STOWED = 1
+    READYING = 2
+    READY = 3
+    APPROACH = 4
+    REACH = 5
+    CONTACT = 6
+    WRAP = 7
+    VERIFY = 8
+    PERCHED = 9
+    UNLOAD = 10
+    RELEASE = 11
+    DEPART = 12
+    STOWING = 13
+    HOLDING = 14
+
+
+@dataclass(frozen=True, slots=True)
+class Running:
+    """The order that is being carried out, and where it ends."""
+
+    request: int
+    order: Order
+    done: frozenset[Phase]
+
+
+@dataclass(frozen=True, slots=True)
+class Anchor:
+    """Vehicle and arm at the moment when the grip was taken for good.
+
+    Attributes:
+        position_w: of the vehicle, m.
+        attitude_wb: of the vehicle.
+        tension: of each tendon, N.
+        section_position_a: where the bar holds the arm, base axes of that moment, m.
+        section_attitude_as: of the held cross-section in those axes.
+        beyond: by how much the wrapped part shortens each tendon's path, m; empty when the model found none.
+    """
+
+    position_w: Vec3
+    attitude_wb: Quaternion
+    tension: tuple[float, ...]
+    section_position_a: Vec3 = ZERO
+    section_attitude_as: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    beyond: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """What the arm's mechanics say, found anew a few times while the cycle runs."""
+
+    t: float  # loop time
+    wrench: WrenchReport
+    tip_a: Vec3  # m, base axes
+    lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Memory of the mission: plain values, so that a record holds all of it."""
+
+    phase: Phase = Phase.STARTUP
+    since: float = 0.0  # loop time of entry
+    t: float = 0.0  # loop time of the previous step
+    running: Running | None = None
+    control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
+    streaming: bool = False  # set-points go out
+    bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
+    bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
+    reference: Reference | None = None
+    heading: float = 0.0  # rad, at which the vehicle faces the bar
+    force: ForceObserver = ForceObserver()
+    tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
+    anchor: Anchor | None = None
+    prediction: Prediction | None = None
+    lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now
+    offset: Vec3 = ZERO  # m, asked move away from the anchor
+    errors: ArmFault = ArmFault.NONE  # latched until the next READY or PERCH
+    warned: frozenset[str] = frozenset()  # notices already given in this phase

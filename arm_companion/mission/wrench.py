@@ -1,0 +1,143 @@
+"""The reaction wrench of the arm on the airframe, predicted from what the phase says about its surroundings."""
+
+import math
+
+import numpy as np
+
+from arm_companion.arm import arc
+from arm_companion.arm.model import ArmSolution, Hold, HoldKind
+from arm_companion.arm.reaction import BodyMotion, Reaction, reaction
+from arm_companion.errors import ModelError
+from arm_companion.geometry import so3
+from arm_companion.geometry.arrays import Array
+from arm_companion.geometry.se3 import Pose
+from arm_companion.mission.facts import Vec3, WrenchReport, WrenchSource
+from arm_companion.mission.motion import ZERO, norm, sub
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import Anchor, Phase, Prediction
+
+_ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
+_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
+_LEAST_HZ = 5.0
+_NAN3: Vec3 = (math.nan, math.nan, math.nan)
+
+
+def predict(s: Situation) -> Prediction:
+    """The newest prediction: the last one while it is young, else a new one.
+
+    Mechanics take milliseconds, so they run at the rate of ARM_REACTION_WRENCH and at each change of phase.
+    """
+    last = s.state.prediction
+    period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
+    if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
+        return last
+    return Prediction(s.t, _wrench(s), _tip(s), _lean(s))
+
+
+def grip(s: Situation) -> Anchor:
+    """The anchor for a grip that has just been taken.
+
+    The hovering vehicle carries no load then, so the part between base and bar has the bend that its tendons
+    alone give it: an arc with the moment `sum r tau (cos phi, sin phi)` all along.
+    """
+    vehicle, tension = s.facts.vehicle, s.state.tension
+    model = s.parameters.model
+    length = s.config.perch.contact_arc_m
+    arm = model.parameters
+    u = arm.H.T @ np.asarray(tension) * (length / arm.EI)
+    R_as, p_as = arc.tip_rotation(u), arc.tip_position(u, length)
+    try:
+        hold = model.anchor(
+            Hold(length, Pose(R_as, p_as)), np.asarray(s.pulls), np.asarray(tension), np.asarray(s.gravity_a)
+        )
+        beyond = () if hold.beyond is None else tuple(float(b) for b in hold.beyond)
+    except ModelError:
+        beyond = ()
+    return Anchor(vehicle.position_w, vehicle.attitude_wb, tension, _vec3(p_as), so3.to_quaternion(R_as), beyond)
+
+
+def anchored(s: Situation, position_w: Vec3) -> ArmSolution:
+    """The arm between the bar and an airframe at `position_w` with the present attitude.
+
+    Raises:
+        ModelError: nothing is anchored, or no equilibrium was found.
+    """
+    anchor = s.state.anchor
+    if anchor is None or not anchor.beyond:
+        raise ModelError("nothing is anchored")
+    then = Pose.of_quaternion(anchor.attitude_wb, np.asarray(anchor.position_w)) @ s.mount
+    now = Pose.of_quaternion(s.facts.vehicle.attitude_wb, np.asarray(position_w)) @ s.mount
+    section = Pose.of_quaternion(anchor.section_attitude_as, np.asarray(anchor.section_position_a))
+    hold = Hold(s.config.perch.contact_arc_m, section, HoldKind.CLAMPED, beyond=np.asarray(anchor.beyond))
+    seen = hold.seen_from(now.inverse() @ then)
+    return s.parameters.model.held(np.asarray(s.pulls), seen, np.asarray(s.gravity_a))
+
+
+def _wrench(s: Situation) -> WrenchReport:
+    """ARM_REACTION_WRENCH: a number only where the model stands for it."""
+    if s.state.phase in _ANCHORED and s.state.anchor is not None:
+        source = WrenchSource.ANCHORED
+    else:
+        source = WrenchSource.CONTACT if s.state.phase in _TOUCHING else WrenchSource.FREE
+    vehicle = s.facts.vehicle
+    try:
+        anchored_now = source is WrenchSource.ANCHORED
+        solution = anchored(s, vehicle.position_w) if anchored_now else s.free_arm
+        if solution is None or not s.vehicle_fresh:
+            return _nothing(source)
+        found = reaction(
+            solution,
+            s.mount,
+            np.asarray(s.gravity_a),
+            BodyMotion(rate=np.asarray(vehicle.rate_b)),
+            age=max(vehicle.position_age_s, vehicle.attitude_age_s),
+        )
+    except ModelError:
+        return _nothing(source)
+    # how the bar pushes on an arm that touches but does not hold is not known
+    return _report(found, source, valid=source is not WrenchSource.CONTACT)
+
+
+def _lean(s: Situation) -> Vec3:
+    """Acceleration that holds the vehicle at its reference against the anchored arm, m/s^2, world axes.
+
+    From the force at the *reference*: a force measured where the vehicle is would cancel the arm's own
+    stiffness, which is positive feedback.
+    """
+    reference, anchor = s.state.reference, s.state.anchor
+    if s.state.phase is not Phase.PERCHED or reference is None or anchor is None:
+        return ZERO
+    if norm(sub(reference.position, anchor.position_w)) == 0.0:
+        return ZERO
+    try:
+        there, here = anchored(s, reference.position), anchored(s, anchor.position_w)
+    except ModelError:
+        return ZERO
+    force_b = s.mount.rotation @ (there.base_wrench[:3] - here.base_wrench[:3])
+    lean = so3.from_quaternion(s.facts.vehicle.attitude_wb) @ force_b / -s.config.vehicle.mass_kg
+    return _vec3(lean)
+
+
+def _tip(s: Situation) -> Vec3:
+    return _NAN3 if s.free_arm is None else _vec3(s.free_arm.tip_position)
+
+
+def _nothing(source: WrenchSource) -> WrenchReport:
+    return WrenchReport(_NAN3, _NAN3, _NAN3, _NAN3, source, valid=False, taut_margin=math.nan, residual=math.nan)
+
+
+def _report(found: Reaction, source: WrenchSource, *, valid: bool) -> WrenchReport:
+    return WrenchReport(
+        _vec3(found.wrench[:3]),
+        _vec3(found.wrench[3:]),
+        _vec3(found.sigma[:3]),
+        _vec3(found.sigma[3:]),
+        source,
+        valid=valid and found.valid,
+        taut_margin=found.taut_margin,
+        residual=found.residual,
+    )
+
+
+def _vec3(v: Array) -> Vec3:
+    return float(v[0]), float(v[1]), float(v[2])
