@@ -1,0 +1,1 @@
+"""The simulated world: plant, autopilot stand-in, servo emulator, and the flights through it."""

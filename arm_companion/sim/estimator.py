@@ -1,0 +1,81 @@
+"""The stand-in's state estimator: truth with errors that wander the way a real filter's do.
+
+A navigation filter smooths, so its errors are slow, not white: each is a first-order Gauss-Markov process,
+which drifts like a bias over its correlation time and keeps its standard deviation for ever.
+"""
+
+import math
+import random
+from dataclasses import dataclass
+
+from arm_companion.sim.flight_control import Estimate
+from arm_companion.sim.ports import RigidState
+
+_PERIOD_S = 0.01
+_REFERENCE_NOISE_M = 0.004
+_MOST_SCALE = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Wander:
+    """One sigma and correlation time of one kind of error."""
+
+    sigma: float
+    correlation_s: float
+
+
+class Estimator:
+    """Adds the errors of a good indoor or RTK estimate, all scaled by the one configured position noise.
+
+    At 4 mm position noise: velocity 10 mm/s, attitude 2 mrad, rates 1 mrad/s, accelerometer 0.05 m/s^2; at most
+    three times that, since inertial sensors do not get worse with the position fix. Zero noise gives the truth.
+    """
+
+    def __init__(self, rng: random.Random, position_noise_m: float) -> None:
+        self._rng = rng
+        scale = min(position_noise_m / _REFERENCE_NOISE_M, _MOST_SCALE)
+        kinds = (
+            _Wander(0.8 * position_noise_m, 20.0),  # drift of the position; with the next one sigma in all
+            _Wander(0.6 * position_noise_m, 0.1),
+            _Wander(0.010 * scale, 0.3),
+            _Wander(0.002 * scale, 10.0),
+            _Wander(0.001 * scale, 0.005),
+            _Wander(0.05 * scale, 0.005),
+        )
+        self._keep = [math.exp(-_PERIOD_S / kind.correlation_s) for kind in kinds for _ in range(3)]
+        sigmas = [kind.sigma for kind in kinds for _ in range(3)]
+        self._kick = [s * math.sqrt(1.0 - k * k) for s, k in zip(sigmas, self._keep, strict=True)]
+        self._error = [rng.gauss(0.0, s) for s in sigmas]
+        self._quiet = position_noise_m == 0.0
+        self._since = 0.0
+
+    def update(self, state: RigidState, dt: float) -> Estimate:
+        """The estimate that belongs to the true `state`, `dt` seconds after the last one."""
+        if self._quiet:
+            return Estimate(state.position_w, state.velocity_w, state.attitude_wb, state.rate_b, state.specific_force_b)
+        self._since += dt
+        if self._since >= _PERIOD_S - 1e-9:
+            self._since -= _PERIOD_S
+            gauss = self._rng.gauss
+            self._error = [
+                keep * error + kick * gauss(0.0, 1.0)
+                for keep, error, kick in zip(self._keep, self._error, self._kick, strict=True)
+            ]
+        e = self._error
+        p, v, r, f = state.position_w, state.velocity_w, state.rate_b, state.specific_force_b
+        w, x, y, z = state.attitude_wb
+        a, b, c = 0.5 * e[9], 0.5 * e[10], 0.5 * e[11]  # small turn in body axes
+        attitude = (
+            w - x * a - y * b - z * c,
+            x + w * a + y * c - z * b,
+            y + w * b + z * a - x * c,
+            z + w * c + x * b - y * a,
+        )
+        norm = math.sqrt(sum(part * part for part in attitude))
+        return Estimate(
+            (p[0] + e[0] + e[3], p[1] + e[1] + e[4], p[2] + e[2] + e[5]),
+            (v[0] + e[6], v[1] + e[7], v[2] + e[8]),
+            (attitude[0] / norm, attitude[1] / norm, attitude[2] / norm, attitude[3] / norm),
+            (r[0] + e[12], r[1] + e[13], r[2] + e[14]),
+            (f[0] + e[15], f[1] + e[16], f[2] + e[17]),
+        )

@@ -1,0 +1,139 @@
+"""One picture of a flight: where it went, what the tendons did, what the arm put on the airframe."""
+
+from pathlib import Path
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from arm_companion.config.schema import Config
+from arm_companion.sim.flight import Flight
+
+_INK = "#1f2933"
+_X, _Y, _Z = "#c2410c", "#0f766e", "#1d4ed8"
+_TRUTH = "#9aa5b1"
+_SHADES = ("#f1f5f9", "#ffffff")
+_PERCHED = "#fef3c7"
+
+
+def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
+    """Write the figure as PNG."""
+    style = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": _INK}
+    with mpl.rc_context(style):
+        figure = Figure(figsize=(11, 9.5), layout="constrained")
+        axes = figure.subplots(5, 1, sharex=True, height_ratios=[1.3, 1.2, 1.0, 1.3, 1.3])
+        start = flight.states[0][0] if flight.states else 0.0
+        for axis in axes:
+            _shade(axis, flight, start)
+        _name_states(axes[0], flight, start)
+        _draw_position(axes[0], flight, config, start)
+        _draw_moves(axes[1], flight, start)
+        _draw_tendons(axes[2], flight, config, start)
+        _draw_force(axes[3], flight, start)
+        _draw_contact(axes[4], flight, start)
+        axes[-1].set_xlabel("time, s")
+        figure.suptitle(title, fontsize=12, fontweight="bold", color=_INK)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, dpi=110)
+
+
+def _shade(axis: Axes, flight: Flight, start: float) -> None:
+    for i, (name, a, b) in enumerate(flight.spans()):
+        axis.axvspan(a - start, b - start, color=_PERCHED if name == "PERCHED" else _SHADES[i % 2], lw=0, zorder=0)
+    axis.margins(x=0)
+    axis.grid(axis="y", color="#e5e7eb", lw=0.6)
+
+
+def _name_states(axis: Axes, flight: Flight, start: float) -> None:
+    total = max(flight.end - start, 1e-9)
+    last = -1.0
+    for name, a, b in flight.spans():
+        middle = (0.5 * (a + b) - start) / total
+        if b - a < 0.012 * total or middle - last < 0.012:
+            continue
+        last = middle
+        axis.text(middle, 1.02, name.lower(), rotation=38, fontsize=7.5, color=_INK, transform=axis.transAxes)
+
+
+def _draw_position(axis: Axes, flight: Flight, config: Config, start: float) -> None:
+    t = [s.t - start for s in flight.samples]
+    x, _, z = config.sim.bar.position_m
+    for i, (name, colour) in enumerate((("north", _X), ("east", _Y), ("up", _Z))):
+        sign = -1.0 if name == "up" else 1.0
+        axis.plot(t, [sign * s.state.position_w[i] for s in flight.samples], color=colour, lw=1.2, label=name)
+    axis.axhline(x, color=_X, lw=0.8, ls=":")
+    axis.axhline(-z, color=_Z, lw=0.8, ls=":")
+    axis.set_ylabel("vehicle, m\n(dotted: bar)")
+    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
+    axis.set_ylabel("move while\nperched, mm")
+    hold = next((mark for mark in flight.marks if mark.name == "hold"), None)
+    perched = [(a, b) for name, a, b in flight.spans() if name == "PERCHED"]
+    if hold is None or not perched:
+        axis.text(0.5, 0.5, "never perched", transform=axis.transAxes, ha="center", color=_INK)
+        return
+    origin = [
+        sum(s.state.position_w[i] for s in flight.within(hold.start, hold.end))
+        / max(len(flight.within(hold.start, hold.end)), 1)
+        for i in range(3)
+    ]
+    samples = flight.within(perched[0][0], perched[-1][1])
+    t = [s.t - start for s in samples]
+    for i, (name, colour) in enumerate((("north", _X), ("east", _Y), ("down", _Z))):
+        axis.plot(t, [1e3 * (s.state.position_w[i] - origin[i]) for s in samples], color=colour, lw=1.0, label=name)
+    for mark in flight.marks:
+        for asked, colour in zip(mark.asked_w, (_X, _Y, _Z), strict=True):
+            if asked:
+                axis.plot([mark.start - start, mark.end - start], [1e3 * asked] * 2, color=colour, lw=3, alpha=0.35)
+    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_tendons(axis: Axes, flight: Flight, config: Config, start: float) -> None:
+    t = [s.t - start for s in flight.samples]
+    for i, angle in enumerate(config.arm.tendons.angles_deg):
+        colour = (_X, _Y, _Z, "#7c3aed")[i % 4]
+        axis.plot(
+            t,
+            [s.truth.tension[i] for s in flight.samples],
+            color=colour,
+            lw=1.0,
+            label=f"{i + 1} at {angle:g}°",
+        )
+        axis.plot(
+            [seen.t - start for seen in flight.tendons],
+            [seen.tension[i] for seen in flight.tendons],
+            color=colour,
+            lw=0.5,
+            alpha=0.5,
+        )
+    axis.set_ylabel("tendon tension, N\n(thin: estimated)")
+    axis.legend(loc="center left", ncols=4, fontsize=8, frameon=False)
+
+
+def _draw_force(axis: Axes, flight: Flight, start: float) -> None:
+    t = [s.t - start for s in flight.samples]
+    for i, (name, colour) in enumerate((("x", _X), ("y", _Y), ("z", _Z))):
+        axis.plot(t, [s.truth.force_b[i] for s in flight.samples], color=colour, lw=0.7, alpha=0.45)
+        seen = [w for w in flight.wrenches if w.valid]
+        axis.plot(
+            [w.t - start for w in seen],
+            [w.force_b[i] for w in seen],
+            ".",
+            color=colour,
+            ms=2.5,
+            label=f"{name} predicted",
+        )
+    axis.set_ylabel("force on the airframe, N\n(line: true, dots: predicted)")
+    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_contact(axis: Axes, flight: Flight, start: float) -> None:
+    t = [s.t - start for s in flight.samples]
+    axis.plot(t, [s.truth.contact_force_n for s in flight.samples], color=_INK, lw=0.9)
+    axis.set_ylabel("contact force, N")
+    right = axis.twinx()
+    right.plot(t, [s.truth.wrap_angle for s in flight.samples], color=_X, lw=0.9)
+    right.set_ylabel("wrap angle, rad", color=_X)
+    right.spines["right"].set_visible(True)

@@ -1,0 +1,244 @@
+"""The physics: an airframe with a continuum arm, a bar and the ground, stepped by MuJoCo.
+
+The mechanics here are the plant's own (`mjcf`); nothing is shared with the model that the daemon flies with.
+NED outside, MuJoCo's z-up world inside: every world vector changes sign in y and z at this border, while body
+vectors are FRD on both sides. The world's origin is the airframe's centre of mass where it stands on its skids.
+"""
+
+import math
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import numpy.typing as npt
+
+from arm_companion.config.schema import Config
+from arm_companion.errors import ModelError
+from arm_companion.sim import mjcf
+from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
+
+# Rotor drag of a small quadrotor is near linear in the air speed: 2 m/s of wind push with 0.5 N.
+_DRAG_N_PER_M_S = 0.25
+_ROTARY_DRAG_NM_PER_RAD_S = 0.01
+
+Array = npt.NDArray[np.float64]
+
+
+class Plant:
+    """The simulated world. One `step` advances it by `config.sim.step_s`; nothing in it is random.
+
+    A tendon's tension is max(0, T0 + k (l - L + pull)): elastic, pull-only, with l the length of its path along
+    the arm and k the stiffness of tendon and servo in series.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._arm = config.arm
+        self._stiffness = mjcf.tendon_stiffness(config.arm)
+        self._wind = mjcf.up(config.sim.wind_m_per_s)
+        self._push: Vec3 = (0.0, 0.0, 0.0)
+        self._model = model = mujoco.MjModel.from_xml_string(mjcf.model_xml(config))
+        self._data = mujoco.MjData(model)
+        self._damping = float(model.tendon_damping[0])
+        self._dt = float(model.opt.timestep)
+        self._airframe = model.body(mjcf.AIRFRAME).id
+        self._base = model.body(mjcf.ARM_BASE).id
+        self._bar = model.body(mjcf.BAR).id
+        self._tip = model.site(mjcf.TIP).id
+        # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
+        self._link_of_geom = np.full(model.ngeom, -1)
+        for i in range(config.arm.disks + 1):
+            body = self._base if i == 0 else model.body(mjcf.link(i)).id
+            self._link_of_geom[model.geom_bodyid == body] = i
+        hinges = [i for i in range(model.njnt) if model.joint(i).name.startswith(mjcf.BENDING)]
+        self._bending = np.array(hinges)
+        self._bending_qpos = model.jnt_qposadr[self._bending]
+        self._bending_stiffness = float(model.jnt_stiffness[hinges[0]])
+        self._excess = mjcf.chord_excess(config.arm)
+        self._velocity_before = np.zeros(model.nv)
+        self._truth: PlantTruth | None = None
+        mujoco.mj_forward(model, self._data)
+        self._set_pulls((0.0,) * model.ntendon)
+        self._data.qacc[:] = 0.0
+
+    @property
+    def time(self) -> float:
+        """Simulated time since construction, s."""
+        return float(self._data.time)
+
+    def step(self, rotors: RotorCommand, pulls: Sequence[float]) -> None:
+        """Advance by one physics step.
+
+        Args:
+            rotors: thrust and torque on the airframe during the step.
+            pulls: m of each tendon taken in from where the straight arm has its pretension.
+
+        Raises:
+            ModelError: when the motion has diverged.
+            ValueError: when there is not one pull for each tendon.
+        """
+        data = self._data
+        self._set_pulls(pulls)
+        w, x, y, z = data.qpos[3:7].tolist()
+        vx, vy, vz, p, q, r = data.qvel[:6].tolist()
+        if not math.isfinite(vx + vy + vz + p + q + r):
+            raise ModelError(f"the plant diverged at {self.time:.3f} s")
+        thrust = -rotors.thrust_n
+        data.qfrc_applied[:6] = (
+            thrust * 2 * (x * z + w * y) - _DRAG_N_PER_M_S * (vx - self._wind[0]) + self._push[0],
+            thrust * 2 * (y * z - w * x) - _DRAG_N_PER_M_S * (vy - self._wind[1]) + self._push[1],
+            thrust * (1 - 2 * (x * x + y * y)) - _DRAG_N_PER_M_S * (vz - self._wind[2]) + self._push[2],
+            rotors.torque_b[0] - _ROTARY_DRAG_NM_PER_RAD_S * p,
+            rotors.torque_b[1] - _ROTARY_DRAG_NM_PER_RAD_S * q,
+            rotors.torque_b[2] - _ROTARY_DRAG_NM_PER_RAD_S * r,
+        )
+        self._velocity_before[:] = data.qvel
+        self._truth = None
+        mujoco.mj_step(self._model, data)
+
+    def state(self) -> RigidState:
+        """True motion of the airframe now; the specific force is the last step's mean."""
+        data = self._data
+        w, x, y, z = data.qpos[3:7].tolist()
+        rotation = _matrix(w, x, y, z)
+        acceleration = (data.qvel[:3] - self._velocity_before[:3]) / self._dt
+        acceleration[2] += mjcf.GRAVITY
+        rate = data.qvel[3:6].tolist()
+        return RigidState(
+            position_w=mjcf.up(data.qpos[:3].tolist()),
+            velocity_w=mjcf.up(data.qvel[:3].tolist()),
+            attitude_wb=_upright(-x, w, -z, y),  # (0, 1, 0, 0) * (w, x, y, z)
+            rate_b=(rate[0], rate[1], rate[2]),
+            specific_force_b=_vec3(rotation.T @ acceleration),
+        )
+
+    def tensions(self) -> tuple[float, ...]:
+        """Tension in N of each tendon, as it acted during the last step."""
+        stretch = self._data.ten_length - self._model.tendon_lengthspring[:, 1]
+        return tuple(np.maximum(0.0, self._stiffness * stretch).tolist())
+
+    def truth(self) -> PlantTruth:
+        """What only a simulation can know: wrench and contacts are those of the last step."""
+        if self._truth is None:
+            self._truth = self._measure()
+        return self._truth
+
+    def move_bar(self, position_w: Sequence[float]) -> None:
+        """Put the bar elsewhere, with its heading kept.
+
+        Args:
+            position_w: a point on its axis, m, NED.
+        """
+        self._data.mocap_pos[0] = mjcf.up(tuple(position_w))
+
+    def push(self, force_w: Sequence[float]) -> None:
+        """Push the airframe at its centre of mass until told otherwise.
+
+        Args:
+            force_w: N, NED; zeros end the push.
+        """
+        self._push = mjcf.up(tuple(force_w))
+
+    def _set_pulls(self, pulls: Sequence[float]) -> None:
+        """Set the tendon springs' rest lengths, beyond which a tendon pulls; a slack tendon does not damp either.
+
+        The arcs between the disks are longer than the hinged chain by `chord_excess` for every squared radian of
+        a hinge: that goes into the rest length, and its derivative, tension times angle, is a spring in the hinge.
+        """
+        model, data, arm = self._model, self._data, self._arm
+        total = sum(self.tensions())
+        bend = data.qpos[self._bending_qpos]
+        model.jnt_stiffness[self._bending] = self._bending_stiffness + 2 * self._excess * total
+        rest = arm.length_m - arm.tendons.pretension_n / self._stiffness - self._excess * float(bend @ bend)
+        for i, (pull, length) in enumerate(zip(pulls, data.ten_length.tolist(), strict=True)):
+            model.tendon_lengthspring[i, 1] = rest - pull
+            model.tendon_damping[i] = self._damping if length > rest - pull else 0.0
+
+    def _measure(self) -> PlantTruth:
+        model, data = self._model, self._data
+        force, torque = self._interface_wrench()
+        contact, net, wrap = self._bar_contact()
+        bodies = model.geom_bodyid[data.contact.geom]
+        outside = np.any((bodies == 0) | (bodies == self._bar), axis=1)  # ground or bar
+        tension = self.tensions()
+        mujoco.mj_kinematics(model, data)  # the tip where it is after the step, as in `state`
+        return PlantTruth(
+            force_b=force,
+            torque_b=torque,
+            contact_force_n=contact,
+            contact_net_w=net,
+            wrap_angle=wrap,
+            tension=tension,
+            tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
+            body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
+        )
+
+    def _interface_wrench(self) -> tuple[Vec3, Vec3]:
+        """Force and torque of the arm on the airframe about its centre of mass, body axes.
+
+        Newton-Euler from the tip to the base with the accelerations that the step really made: under implicit
+        integration they differ from the forward dynamics' own.
+        """
+        model, data = self._model, self._data
+        data.qacc[:] = (data.qvel - self._velocity_before) / self._dt
+        mujoco.mj_rnePostConstraint(model, data)
+        wrench = data.cfrc_int[
+            self._base
+        ]  # torque, force of the airframe on the arm, about the tree's centre
+        centre = data.subtree_com[self._airframe] - data.xpos[self._airframe]
+        rotation = data.xmat[self._airframe].reshape(3, 3)
+        force = -wrench[3:]
+        torque = -wrench[:3] + np.cross(centre, force)
+        return _vec3(rotation.T @ force), _vec3(rotation.T @ torque)
+
+    def _bar_contact(self) -> tuple[float, Vec3, float]:
+        """Sum of normal forces, net force on the arm (NED) and wrap angle of the arm's contacts with the bar."""
+        model, data = self._model, self._data
+        total, net = 0.0, np.zeros(3)
+        touches: list[tuple[int, Array]] = []
+        result = np.zeros(6)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            one, other = contact.geom
+            if model.geom_bodyid[other] == self._bar:
+                one, other = other, one
+                sign = 1.0  # the contact frame points from the bar to the arm
+            else:
+                sign = -1.0
+            number = self._link_of_geom[other]
+            if model.geom_bodyid[one] != self._bar or number < 0 or contact.efc_address < 0:
+                continue
+            mujoco.mj_contactForce(model, data, i, result)
+            if result[0] <= 0.0:
+                continue
+            total += result[0]
+            net += sign * contact.frame.reshape(3, 3).T @ result[:3]
+            touches.append((int(number), contact.pos.copy()))
+        axes = data.xmat[self._bar].reshape(3, 3)
+        centre = data.xpos[self._bar]
+        angles = []
+        for _, position in sorted(touches, key=lambda touch: touch[0]):
+            _, v, w = axes.T @ (position - centre)
+            angles.append(math.atan2(w, v))
+        turns = [math.remainder(b - a, math.tau) for a, b in zip(angles, angles[1:], strict=False)]
+        reached = np.cumsum([0.0, *turns])
+        return float(total), mjcf.up(net.tolist()), float(reached.max() - reached.min())
+
+
+def _matrix(w: float, x: float, y: float, z: float) -> Array:
+    return np.array(
+        (
+            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        )
+    )
+
+
+def _upright(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """The one of a rotation's two quaternions that has w >= 0."""
+    return (w, x, y, z) if w >= 0 else (-w, -x, -y, -z)
+
+
+def _vec3(v: Array) -> Vec3:
+    x, y, z = v.tolist()
+    return (x, y, z)

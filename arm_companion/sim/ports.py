@@ -1,0 +1,42 @@
+"""What plant, autopilot stand-in and servo emulator tell each other: values, never references.
+
+World axes are NED with the origin at the vehicle's centre of mass where it stands before take-off.
+Quaternions are (w, x, y, z) and turn body axes (FRD) into world axes.
+"""
+
+from dataclasses import dataclass
+
+Vec3 = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RigidState:
+    """True motion of the airframe."""
+
+    position_w: Vec3  # m, centre of mass
+    velocity_w: Vec3  # m/s
+    attitude_wb: tuple[float, float, float, float]
+    rate_b: Vec3  # rad/s
+    specific_force_b: Vec3  # m/s^2, what an accelerometer at the centre of mass reads
+
+
+@dataclass(frozen=True, slots=True)
+class RotorCommand:
+    """What the rotors exert on the airframe now (motor lag is the autopilot stand-in's part)."""
+
+    thrust_n: float  # along -z of the body
+    torque_b: Vec3  # N m
+
+
+@dataclass(frozen=True, slots=True)
+class PlantTruth:
+    """What only the plant knows, for verdicts and figures; nothing of it reaches the daemon."""
+
+    force_b: Vec3  # N, of the arm on the airframe, body axes
+    torque_b: Vec3  # N m, of the arm on the airframe about the airframe's centre of mass, body axes
+    contact_force_n: float  # sum of the normal forces between arm and bar
+    contact_net_w: Vec3  # N, net force of the bar on the arm, world axes
+    wrap_angle: float  # rad of the bar's circumference that the arm's contacts span, seen along its axis
+    tension: tuple[float, ...]  # N, true tendon tensions
+    tip_position_w: Vec3  # m
+    body_contact: bool  # the airframe itself touches bar or ground

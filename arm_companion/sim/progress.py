@@ -1,0 +1,72 @@
+"""What a person sees of a scenario: a line for everything that happens, and the verdict as one table."""
+
+import asyncio
+import math
+from pathlib import Path
+from typing import TextIO
+
+from rich.console import Console
+from rich.table import Table
+
+from arm_companion.sim.verdict import Verdict
+
+
+class Progress:
+    """Prints each event with the time since the start."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.console = Console(file=stream, highlight=False)
+        self._start: float | None = None
+
+    def say(self, text: str) -> None:
+        """One event, now."""
+        now = asyncio.get_running_loop().time()
+        self._start = now if self._start is None else self._start
+        style = "bold" if text.startswith("state") else "yellow" if text.startswith("“") else ""
+        self.console.print(
+            f"[dim]{now - self._start:7.2f} s[/dim]  {text.replace('[', '(')}", style=style, soft_wrap=True
+        )
+
+
+def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
+    """The table at the end, the verdict, and where to look further."""
+    table = Table(title="Anchor perch", title_justify="left", show_header=True, header_style="bold")
+    table.add_column("what")
+    table.add_column("value", justify="right")
+    table.add_column("remark")
+    for name, seconds in verdict.states:
+        table.add_row(f"in {name}", f"{seconds:.1f} s", "")
+    table.add_section()
+    mean, most = verdict.contact_force_n
+    table.add_row("contact force while perched", f"{mean:.1f} N", f"greatest {most:.1f} N")
+    table.add_row("arm around the bar", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while perched")
+    for wrench in verdict.wrench:
+        table.add_row(
+            f"wrench on airframe, {wrench.span}",
+            f"{wrench.force_error_n:.2f} N RMS error",
+            f"true {wrench.true_force_n:.2f} N; torque error {wrench.torque_error_nm:.3f} "
+            f"of {wrench.true_torque_nm:.3f} N m; "
+            f"{wrench.predictions} predictions",
+        )
+    table.add_section()
+    table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
+    for move in verdict.moves:
+        table.add_row(
+            move.name,
+            f"{_mm(move.made_m)} made",
+            f"asked {_mm(move.asked_m)}, error {_mm(move.error_m)}, arm's force {move.force_n:.1f} N",
+        )
+    console.print(table)
+    style = "bold green" if verdict.success else "bold red"
+    console.print(
+        f"verdict: {verdict.verdict}" + (f" ({verdict.reason})" if verdict.reason else ""),
+        style=style,
+        soft_wrap=True,
+    )
+    for path in files:
+        if path.exists():
+            console.print(f"  {path}", soft_wrap=True)
+
+
+def _mm(metres: float) -> str:
+    return "-" if math.isnan(metres) else f"{metres * 1e3:.1f} mm"

@@ -1,0 +1,158 @@
+"""Starts a whole flight: in real time with the daemon as its own process, or in simulated time in one."""
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from arm_companion.app import Daemon, Openers
+from arm_companion.clock import SIMULATED_EPOCH_S, Clock
+from arm_companion.config.schema import Config
+from arm_companion.recorder import MemoryRecorder, Record
+from arm_companion.sim.flight import Flight
+from arm_companion.sim.operator_link import OperatorLink
+from arm_companion.sim.scenario import Operator, Say
+from arm_companion.sim.servo_emulator import EmulatedBus
+from arm_companion.sim.world import World
+from arm_companion.supervisor import ServiceManager
+from arm_companion.transport.base import Opener
+from arm_companion.transport.memory import MemoryPipe
+from arm_companion.transport.urls import open_url
+
+_STOP_WITHIN_S = 5.0
+Prepare = Callable[[World], None]
+
+
+@dataclass
+class Result:
+    """What a flight leaves behind."""
+
+    flight: Flight
+    failure: str
+    cycles: int = 0
+    missed: int = 0
+    records: list[Record] = dataclasses.field(default_factory=list)
+
+
+class DaemonDied(Exception):
+    """The daemon's process ended while it was needed."""
+
+
+async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: None) -> Result:
+    """One perch on the running simulated loop: every part in this process, over in-memory pipes."""
+    companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
+    world = World(config)
+    prepare(world)
+    clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
+    recorder = MemoryRecorder()
+    openers = Openers(
+        {
+            name: companion.opener(1) if link.role == "autopilot" else arm.opener(0)
+            for name, link in config.links.items()
+        },
+        servos.opener(1),
+    )
+    daemon = Daemon(config, openers, clock, ServiceManager(""), recorder)
+    bus = EmulatedBus(world.servos, config.servos)
+    flight = Flight(samples=world.samples)
+    link = OperatorLink([ground.opener(1), arm.opener(1)])
+    stop = asyncio.Event()
+    async with _running(
+        world.run,
+        lambda: world.autopilot.run(companion.opener(0), ground.opener(0)),
+        lambda: bus.serve_memory(servos.opener(0)),
+        lambda: daemon.run(stop),
+        link.run,
+    ):
+        failure = await Operator(link, config, flight, say).fly_perch()
+        stop.set()
+        await asyncio.sleep(0.5)
+    return Result(flight, failure, daemon.cycles, daemon.missed, recorder.records)
+
+
+async def fly_real_time(
+    config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, prepare: Prepare = lambda _: None
+) -> Result:
+    """One perch in real time: UDP, a pty, and the daemon as in flight, in a process of its own.
+
+    Args:
+        config: the configuration that the daemon is given too.
+        daemon_arguments: what follows `arm-companion` on its command line.
+        log: where the daemon's standard error goes.
+        say: told what happens.
+        prepare: changes the world before the flight.
+    """
+    world = World(config)
+    prepare(world)
+    bus = EmulatedBus(world.servos, config.servos)
+    flight = Flight(samples=world.samples)
+    sim = config.sim
+    link = OperatorLink([open_url(sim.operator_autopilot_url), open_url(sim.operator_arm_url)])
+    ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
+    async with _running(
+        world.run,
+        lambda: world.autopilot.run(open_url(sim.autopilot_url), ground),
+        lambda: bus.serve_pty(config.servos.port),
+        link.run,
+    ):
+        await bus.wait_ready()
+        async with _daemon_process(daemon_arguments, log) as daemon:
+            operator = asyncio.create_task(Operator(link, config, flight, say).fly_perch())
+            died = asyncio.create_task(daemon.wait())
+            await asyncio.wait({operator, died}, return_when=asyncio.FIRST_COMPLETED)
+            if not operator.done():
+                operator.cancel()
+                await asyncio.gather(operator, return_exceptions=True)
+                raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+            died.cancel()
+            failure = operator.result()
+    if world.lost_s > 0.0:
+        say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
+    return Result(flight, failure)
+
+
+@contextlib.asynccontextmanager
+async def _running(*tasks: Callable[[], Awaitable[None]]) -> AsyncIterator[None]:
+    """Run tasks in the background; one that fails ends the block, and leaving it cancels them all."""
+
+    async def run(task: Callable[[], Awaitable[None]]) -> None:
+        await task()
+
+    async with asyncio.TaskGroup() as group:
+        running = [group.create_task(run(task)) for task in tasks]
+        try:
+            yield
+        finally:
+            for task in running:
+                task.cancel()
+
+
+@contextlib.asynccontextmanager
+async def _daemon_process(arguments: Sequence[str], log: Path) -> AsyncIterator[asyncio.subprocess.Process]:
+    """The daemon as a process; it is asked to stop with SIGTERM, and killed only if it does not."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("wb") as stream:
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "arm_companion",
+            *arguments,
+            stdout=stream,
+            stderr=stream,
+            env=dict(os.environ),
+        )
+        try:
+            yield process
+        finally:
+            if process.returncode is None:
+                process.send_signal(signal.SIGTERM)
+                try:
+                    await asyncio.wait_for(process.wait(), _STOP_WITHIN_S)
+                except TimeoutError:
+                    process.kill()
+                    await process.wait()

@@ -1,0 +1,221 @@
+"""What the operator on the ground does in a scenario: a script of MAVLink commands and waits, nothing else.
+
+It sees what a ground station sees; the plant's truth is for the verdict alone.
+"""
+
+import asyncio
+from collections.abc import Callable
+from typing import Any
+
+from arm_companion.config.schema import Config
+from arm_companion.protocol.dialect import mav
+from arm_companion.sim.flight import Flight, Mark, TendonsSeen, Vec3, WrenchSeen
+from arm_companion.sim.operator_link import Address, OperatorLink
+
+Say = Callable[[str], None]
+
+_PULL_M = 0.010
+_HOLD_S = 3.0
+_PULL_S = 4.0
+_OFFBOARD = 6
+_CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+
+
+class ScenarioFailed(Exception):
+    """The script cannot go on; the reason is for people."""
+
+
+class Operator:
+    """Flies one vehicle with one arm from the ground."""
+
+    def __init__(self, link: OperatorLink, config: Config, flight: Flight, say: Say) -> None:
+        self._link = link
+        self._config = config
+        self._flight = flight
+        self._say = say
+        self._arm = (1, config.vehicle.component_id)
+        self._autopilot = (1, 1)
+        link.watch(self._see)
+
+    # --- what is seen ---
+
+    def _see(self, message: Any) -> None:
+        t = asyncio.get_running_loop().time()
+        flight = self._flight
+        match message.get_type():
+            case "ARM_STATUS":
+                if not flight.states or flight.states[-1][1] != message.state_name:
+                    flight.states.append((t, message.state_name))
+                    self._say(f"state {message.state_name}")
+            case "ARM_REACTION_WRENCH":
+                flight.wrenches.append(
+                    WrenchSeen(
+                        t,
+                        _vec3(message.force),
+                        _vec3(message.torque),
+                        _vec3(message.force_sigma),
+                        bool(message.validity),
+                        message.source,
+                    )
+                )
+            case "ARM_TENDONS":
+                flight.tendons.append(TendonsSeen(t, tuple(message.tension)))
+            case "STATUSTEXT":
+                flight.texts.append((t, message.text))
+                if message.severity <= mav.MAV_SEVERITY_WARNING:
+                    self._say(f"“{message.text}”")
+
+    def _state(self) -> str:
+        return self._flight.states[-1][1] if self._flight.states else ""
+
+    # --- what is done ---
+
+    async def fly_perch(self) -> str:
+        """The whole flight. Returns why it failed, or an empty string."""
+        failure = ""
+        try:
+            await self._prepare()
+            await self._take_off()
+            await self._perch()
+            await self._pull()
+            await self._release()
+        except (ScenarioFailed, TimeoutError) as error:
+            failure = str(error) or "the operator waited too long"
+            self._say(f"failed: {failure}")
+        try:
+            await self._come_home()
+        except (ScenarioFailed, TimeoutError) as error:
+            failure = "; ".join(filter(None, (failure, f"no safe end: {error}")))
+        self._flight.end = asyncio.get_running_loop().time()
+        return failure
+
+    async def _prepare(self) -> None:
+        self._say("waiting for autopilot and arm")
+        await self._wait(lambda: self._heard(self._autopilot), 30.0, "no heartbeat from the autopilot")
+        await self._wait(lambda: self._heard(self._arm), 15.0, "no heartbeat from the arm")
+        await self._wait(lambda: self._state() == "STOWED", 10.0, "the arm is not stowed")
+
+    async def _take_off(self) -> None:
+        self._say("arm made ready, vehicle takes off")
+        await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=30.0)
+        height = self._config.sim.takeoff_height_m
+        await self._vehicle(
+            mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"
+        )
+        await self._wait(lambda: abs(self._height() - height) < 0.15, 30.0, "the vehicle does not reach its height")
+        await asyncio.sleep(2.0)
+        self._say("external set-points on")
+        await self._vehicle(mav.MAV_CMD_DO_SET_MODE, [_CUSTOM_MODE, self._external_mode()], "mode change")
+        await self._wait(self._is_external, 5.0, "the autopilot does not take external set-points")
+
+    async def _perch(self) -> None:
+        self._say("PERCH")
+        await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
+
+    async def _pull(self) -> None:
+        """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, and back each time."""
+        await asyncio.sleep(2.0)
+        await self._measure("hold", (0.0, 0.0, 0.0), _HOLD_S)
+        for name, move in (("x", (_PULL_M, 0.0, 0.0)), ("z", (0.0, 0.0, _PULL_M))):
+            self._say(f"pull 10 mm in {name}")
+            await self._jog(move)
+            await asyncio.sleep(_PULL_S)
+            await self._measure(f"pull {name}", move, _HOLD_S)
+            await self._jog((0.0, 0.0, 0.0))
+            await asyncio.sleep(_PULL_S)
+        if self._state() != "PERCHED":
+            raise ScenarioFailed(f"the perch ended by itself in {self._state()}")
+
+    async def _release(self) -> None:
+        self._say("RELEASE")
+        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 90.0)
+
+    async def _come_home(self) -> None:
+        """Stow and land, whatever came before; a failed perch must end on the ground as well."""
+        if not self._heard(self._autopilot):
+            raise ScenarioFailed("the autopilot is gone")
+        quiet = ("STOWED", "READY", "HOLDING", "")
+        await self._wait(lambda: self._state() in quiet, 90.0, f"the arm stays in {self._state()}")
+        if self._state() == "HOLDING":
+            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 60.0)
+        if self._state() == "READY":
+            await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
+        self._say("landing")
+        await self._vehicle(mav.MAV_CMD_NAV_LAND, [0, 0, 0, float("nan"), float("nan"), float("nan"), 0], "landing")
+        await self._wait(lambda: not self._armed(), 60.0, "the vehicle does not land and disarm")
+
+    # --- small things ---
+
+    async def _order(self, command: int, name: str, timeout_s: float) -> None:
+        result = await self._link.command(command, [0.0] * 7, target=self._arm, timeout=timeout_s)
+        if result != mav.MAV_RESULT_ACCEPTED:
+            raise ScenarioFailed(f"{name}: {self._why(result)}")
+
+    def _why(self, result: int) -> str:
+        warnings = [text for _, text in self._flight.texts[-3:] if "->" in text or "rejected" in text]
+        name = mav.enums["MAV_RESULT"][result].name.removeprefix("MAV_RESULT_").lower()
+        return f"{name} ({warnings[-1]})" if warnings else name
+
+    async def _jog(self, move_w: Vec3) -> None:
+        parameters = [float(mav.ARM_JOG_KIND_VEHICLE), *move_w, 0.0, 0.0, 0.0]
+        result = await self._link.command(mav.MAV_CMD_ARM_JOG, parameters, target=self._arm, timeout=5.0)
+        if result != mav.MAV_RESULT_ACCEPTED:
+            raise ScenarioFailed(f"JOG: {self._why(result)}")
+
+    async def _vehicle(self, command: int, parameters: list[float], what: str, retry_s: float = 0.0) -> None:
+        """A command to the autopilot, repeated for `retry_s` while it is not ready yet."""
+        loop = asyncio.get_running_loop()
+        until = loop.time() + retry_s
+        padded = [*parameters, *[0.0] * (7 - len(parameters))]
+        while True:
+            result = await self._link.command(command, padded, target=self._autopilot, timeout=5.0)
+            if result == mav.MAV_RESULT_ACCEPTED:
+                return
+            if loop.time() >= until:
+                raise ScenarioFailed(f"{what}: {self._why(result)}")
+            await asyncio.sleep(1.0)
+
+    async def _measure(self, name: str, asked_w: Vec3, seconds: float) -> None:
+        loop = asyncio.get_running_loop()
+        start = loop.time()
+        await asyncio.sleep(seconds)
+        self._flight.marks.append(Mark(name, start, loop.time(), asked_w))
+
+    async def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not condition():
+                    await asyncio.sleep(0.05)
+        except TimeoutError:
+            raise ScenarioFailed(otherwise) from None
+
+    def _heard(self, who: Address) -> bool:
+        return self._link.latest("HEARTBEAT", who) is not None
+
+    def _height(self) -> float:
+        position = self._link.latest("LOCAL_POSITION_NED", self._autopilot)
+        return -position.z if position is not None else 0.0
+
+    def _heartbeat(self) -> Any:
+        return self._link.latest("HEARTBEAT", self._autopilot)
+
+    def _armed(self) -> bool:
+        heartbeat = self._heartbeat()
+        return heartbeat is not None and bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
+
+    def _external_mode(self) -> float:
+        return 4.0 if self._config.vehicle.autopilot == "ardupilot" else float(_OFFBOARD)
+
+    def _is_external(self) -> bool:
+        heartbeat = self._heartbeat()
+        if heartbeat is None:
+            return False
+        if self._config.vehicle.autopilot == "ardupilot":
+            return bool(heartbeat.custom_mode == int(self._external_mode()))
+        return bool((heartbeat.custom_mode >> 16) & 0xFF == _OFFBOARD)
+
+
+def _vec3(values: Any) -> Vec3:
+    x, y, z = values
+    return (x, y, z)

@@ -1,0 +1,174 @@
+"""Did it perch and let go? Judged by the plant's truth, never by what the daemon says of itself."""
+
+import math
+import statistics
+from dataclasses import dataclass, field
+
+from arm_companion.sim.flight import Flight, Mark, WrenchSeen
+from arm_companion.sim.world import Sample
+
+_HELD_SHARE = 0.95
+_HELD_WRAP_RAD = 2.0
+_HELD_FORCE_N = 0.05
+_AIRBORNE_M = 0.5
+_CLEAR_S = 1.0
+_LANDED_M = 0.15
+
+
+@dataclass(frozen=True)
+class WrenchError:
+    """Predicted against true wrench on the airframe over one span, RMS."""
+
+    span: str
+    predictions: int
+    true_force_n: float
+    force_error_n: float
+    true_torque_nm: float
+    torque_error_nm: float
+
+
+@dataclass(frozen=True)
+class Move:
+    """One asked move of the anchored vehicle and what became of it."""
+
+    name: str
+    asked_m: float
+    made_m: float  # along the asked direction
+    error_m: float  # distance from where it was asked to be, mean
+    force_n: float  # true force of the arm on the airframe, mean magnitude
+
+
+@dataclass
+class Verdict:
+    """The end of a flight in numbers."""
+
+    success: bool
+    verdict: str
+    reason: str
+    states: list[tuple[str, float]] = field(default_factory=list)
+    contact_force_n: tuple[float, float] = (0.0, 0.0)  # mean and greatest while perched
+    wrap_rad: float = 0.0
+    wrench: list[WrenchError] = field(default_factory=list)
+    moves: list[Move] = field(default_factory=list)
+    hover_error_m: float = math.nan  # RMS about the mean while perched and not moved
+
+
+def judge(flight: Flight, failure: str) -> Verdict:
+    """The verdict on a perch flight.
+
+    Args:
+        flight: what was seen.
+        failure: why the operator's script ended early; empty when it went through.
+    """
+    reasons = [failure] if failure else []
+    spans = flight.spans()
+    perched = [s for name, start, end in spans if name == "PERCHED" for s in flight.within(start, end)]
+    held = _held(perched)
+    if not perched:
+        reasons.append("never perched")
+    elif held < _HELD_SHARE:
+        reasons.append(f"the arm held the bar only {held:.0%} of the time it said so")
+    reasons += _after(flight, bool(perched))
+    reasons += _unharmed(flight)
+    verdict = Verdict(not reasons, "perched" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
+    verdict.states = [(name, end - start) for name, start, end in spans]
+    if perched:
+        forces = [s.truth.contact_force_n for s in perched]
+        verdict.contact_force_n = (statistics.fmean(forces), max(forces))
+        verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in perched)
+    for name in ("free", "perched"):
+        if (error := _wrench_error(flight, name, spans)) is not None:
+            verdict.wrench.append(error)
+    still = next((mark for mark in flight.marks if mark.name == "hold"), None)
+    if still is not None:
+        verdict.hover_error_m = _spread(flight.within(still.start, still.end))
+        verdict.moves = [_move(flight, mark, still) for mark in flight.marks if mark is not still]
+    return verdict
+
+
+def _held(perched: list[Sample]) -> float:
+    """Share of the samples in which the arm really holds the bar."""
+    if not perched:
+        return 0.0
+    good = [s.truth.contact_force_n > _HELD_FORCE_N and s.truth.wrap_angle > _HELD_WRAP_RAD for s in perched]
+    return sum(good) / len(good)
+
+
+def _after(flight: Flight, perched: bool) -> list[str]:
+    """What is wrong with the end: still at the bar, or not on the ground."""
+    if not flight.samples:
+        return ["nothing was measured"]
+    reasons = []
+    last = flight.within(flight.end - _CLEAR_S, flight.end)
+    if perched and any(s.truth.contact_force_n > 0.0 for s in last):
+        reasons.append("the arm did not let go of the bar")
+    if (
+        math.hypot(flight.samples[-1].state.velocity_w[2]) > _LANDED_M
+        or flight.samples[-1].state.position_w[2] < -_LANDED_M
+    ):
+        reasons.append("the vehicle did not land")
+    return reasons
+
+
+def _unharmed(flight: Flight) -> list[str]:
+    """What must never happen: the airframe touches bar or ground while it flies."""
+    touching = [s for s in flight.samples if s.state.position_w[2] < -_AIRBORNE_M and s.truth.body_contact]
+    if not touching:
+        return []
+    return [f"the airframe touched something in flight at {touching[0].t - flight.samples[0].t:.1f} s"]
+
+
+def _wrench_error(flight: Flight, name: str, spans: list[tuple[str, float, float]]) -> WrenchError | None:
+    inside = [(a, b) for state, a, b in spans if (state == "PERCHED") == (name == "perched") and b > a]
+    free = {"READY", "APPROACH", "DEPART"}
+    if name == "free":
+        inside = [(a, b) for state, a, b in spans if state in free]
+    pairs: list[tuple[WrenchSeen, Sample]] = []
+    for seen in flight.wrenches:
+        sample = flight.sample_at(seen.t)
+        if seen.valid and sample is not None and any(a <= seen.t <= b for a, b in inside):
+            pairs.append((seen, sample))
+    if not pairs:
+        return None
+    return WrenchError(
+        name,
+        len(pairs),
+        _rms([math.dist(s.truth.force_b, (0, 0, 0)) for _, s in pairs]),
+        _rms([math.dist(w.force_b, s.truth.force_b) for w, s in pairs]),
+        _rms([math.dist(s.truth.torque_b, (0, 0, 0)) for _, s in pairs]),
+        _rms([math.dist(w.torque_b, s.truth.torque_b) for w, s in pairs]),
+    )
+
+
+def _move(flight: Flight, mark: Mark, still: Mark) -> Move:
+    origin = _mean_position(flight.within(still.start, still.end))
+    samples = flight.within(mark.start, mark.end)
+    asked = math.hypot(*mark.asked_w)
+    along = [
+        sum(a * (p - o) for a, p, o in zip(mark.asked_w, s.state.position_w, origin, strict=True)) for s in samples
+    ]
+    target = tuple(o + a for o, a in zip(origin, mark.asked_w, strict=True))
+    return Move(
+        mark.name,
+        asked,
+        statistics.fmean(along) / asked if along else math.nan,
+        statistics.fmean(math.dist(s.state.position_w, target) for s in samples) if samples else math.nan,
+        statistics.fmean(math.hypot(*s.truth.force_b) for s in samples) if samples else math.nan,
+    )
+
+
+def _mean_position(samples: list[Sample]) -> tuple[float, ...]:
+    return (
+        tuple(statistics.fmean(s.state.position_w[i] for s in samples) for i in range(3))
+        if samples
+        else (math.nan,) * 3
+    )
+
+
+def _spread(samples: list[Sample]) -> float:
+    centre = _mean_position(samples)
+    return _rms([math.dist(s.state.position_w, centre) for s in samples])
+
+
+def _rms(values: list[float]) -> float:
+    return math.sqrt(statistics.fmean(v * v for v in values)) if values else math.nan
