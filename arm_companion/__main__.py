@@ -1,0 +1,45 @@
+"""The `arm-companion` command."""
+
+import argparse
+import importlib
+import sys
+
+from arm_companion import __version__
+from arm_companion.errors import ArmError, ConfigError
+
+_COMMANDS = {
+    "run": "the daemon: fly the arm",
+    "sim": "fly a scenario in the simulated world with the real daemon",
+    "config": "check or show a configuration",
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line and run one command; returns the exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    parser = argparse.ArgumentParser(
+        prog="arm-companion", description="Companion-computer service for a continuum arm on a drone."
+    )
+    parser.add_argument("--version", action="version", version=f"arm-companion {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    named = next((word for word in words if not word.startswith("-")), None)
+    for name, text in _COMMANDS.items():
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        if name == named:  # only the command that runs is imported: the daemon must start quickly
+            module = importlib.import_module(f"arm_companion.cli.{name}")
+            module.add_arguments(sub)
+            sub.set_defaults(run=module.run)
+    arguments = parser.parse_args(words)
+    try:
+        code: int = arguments.run(arguments)
+    except ConfigError as error:
+        print(f"arm-companion: {error}", file=sys.stderr)
+        return error.exit_code
+    except ArmError as error:
+        print(f"arm-companion: {error}", file=sys.stderr)
+        return 1
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())

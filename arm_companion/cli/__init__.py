@@ -1,0 +1,1 @@
+"""The commands of `arm-companion`, one module each."""

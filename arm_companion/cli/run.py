@@ -1,0 +1,41 @@
+"""`arm-companion run`: the daemon."""
+
+import argparse
+import asyncio
+import logging
+import sys
+
+from arm_companion.app import Daemon, open_configured
+from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.clock import Clock, unix_now
+from arm_companion.supervisor import ServiceManager, stop_on_signals
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `arm-companion run`."""
+    add_config_arguments(parser)
+    parser.add_argument("--verbose", action="store_true", help="log every state of links and servos")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run the daemon until SIGTERM or SIGINT; exit code 0 after an orderly stop."""
+    logging.basicConfig(
+        level=logging.DEBUG if arguments.verbose else logging.INFO,
+        format="%(levelname)s %(name)s: %(message)s",
+        stream=sys.stderr,
+    )
+    config = load_from(arguments)
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        restore = stop_on_signals(stop)
+        manager = ServiceManager()
+        try:
+            clock = Clock(asyncio.get_running_loop(), unix_now())
+            await Daemon(config, open_configured(config), clock, manager).run(stop)
+        finally:
+            restore()
+            manager.close()
+
+    asyncio.run(main())
+    return 0

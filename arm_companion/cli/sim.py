@@ -1,0 +1,130 @@
+"""`arm-companion sim`: a scenario in the simulated world, with the real daemon."""
+
+import argparse
+import asyncio
+import importlib.util
+import json
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.config import Config
+from arm_companion.errors import ArmError
+
+_SCENARIOS = ("perch",)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `arm-companion sim`."""
+    parser.add_argument("scenario", choices=_SCENARIOS, help="perch: take off, wrap a bar, be pulled, let go, land")
+    add_config_arguments(parser, default="sim.toml")
+    parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
+    parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
+    parser.add_argument("--json", action="store_true", help="print the verdict as one JSON object on the last line")
+    parser.add_argument(
+        "--output",
+        type=Path,
+        default=Path("build/sim"),
+        metavar="DIR",
+        help="for log and figure (default: build/sim)",
+    )
+    parser.add_argument(
+        "--log", type=Path, metavar="FILE", help="write the daemon's record here (default: DIR/record.jsonl)"
+    )
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fly the scenario; exit code 0 only when it perched and let go."""
+    for name in ("matplotlib", "mujoco", "rich"):
+        if importlib.util.find_spec(name) is None:
+            print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
+            return 2
+    if arguments.seed is not None:
+        arguments.settings.append(f"sim.seed={arguments.seed}")
+    config = load_from(arguments)
+    return _fly(arguments, config)
+
+
+def _fly(arguments: argparse.Namespace, config: Config) -> int:
+    from arm_companion.sim.figure import draw  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.progress import Progress, show_verdict  # noqa: PLC0415
+    from arm_companion.sim.verdict import judge  # noqa: PLC0415
+
+    output: Path = arguments.output
+    output.mkdir(parents=True, exist_ok=True)
+    started = time.perf_counter()
+    progress = Progress(sys.stderr if arguments.json else sys.stdout)
+    try:
+        result = (
+            _simulated(arguments, config, progress) if arguments.simulated else _real_time(arguments, config, progress)
+        )
+    except (ArmError, OSError) as error:
+        print(f"arm-companion sim: {error}", file=sys.stderr)
+        return 1
+    verdict = judge(result.flight, result.failure)
+    figure = output / "perch.png"
+    draw(result.flight, config, f"Anchor perch: {verdict.verdict}", figure)
+    log = output / "events.log"
+    start = result.flight.samples[0].t if result.flight.samples else 0.0
+    log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
+    show_verdict(verdict, progress.console, [figure, log, _record_path(arguments)])
+    if arguments.json:
+        wall = time.perf_counter() - started
+        print(json.dumps(_summary(verdict, result, wall)))
+    return 0 if verdict.success else 1
+
+
+def _record_path(arguments: argparse.Namespace) -> Path:
+    path: Path = arguments.log or arguments.output / "record.jsonl"
+    return path
+
+
+def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+    from arm_companion.clock import run_simulated  # noqa: PLC0415
+    from arm_companion.record_codec import dumps  # noqa: PLC0415
+    from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
+
+    result = run_simulated(fly_simulated(config, progress.say))
+    path = _record_path(arguments)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", encoding="utf-8") as stream:
+        stream.writelines(dumps(record) + "\n" for record in result.records)
+    return result
+
+
+def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+    from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
+
+    path = _record_path(arguments)
+    words = ["run", "--config", arguments.config]
+    for setting in (*arguments.settings, f'record.file="{path.resolve()}"'):
+        words += ["--set", setting]
+    return asyncio.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+
+
+def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
+    """The command-line contract of `sim --json`."""
+    perched = next((w for w in verdict.wrench if w.span == "perched"), None)
+    moves = [move.error_m for move in verdict.moves]
+    samples = result.flight.samples
+    return {
+        "scenario": "perch",
+        "verdict": verdict.verdict,
+        "reason": verdict.reason,
+        "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
+        "wrench_rms_error_n": _number(perched.force_error_n if perched else math.nan),
+        "wrench_rms_n": _number(perched.true_force_n if perched else math.nan),
+        "pose_error_with_m": _number(max(moves) if moves else math.nan),
+        "pose_error_without_m": None,
+        "cycles": result.cycles,
+        "missed_cycles": result.missed,
+        "wall_s": round(wall_s, 3),
+        "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
+    }
+
+
+def _number(value: float) -> float | None:
+    return None if math.isnan(value) else round(value, 6)
