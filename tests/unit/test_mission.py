@@ -1,0 +1,232 @@
+"""The mission's step, one situation at a time, with plain facts and no device."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import pytest
+
+from arm_companion.mission.facts import (
+    Answer,
+    ArmAction,
+    ArmFault,
+    Commands,
+    Control,
+    Facts,
+    Order,
+    Request,
+    Result,
+)
+from arm_companion.mission.mission import step
+from arm_companion.mission.motion import Reference
+from arm_companion.mission.situation import Parameters
+from arm_companion.mission.state import Anchor, Phase, Running, State
+from arm_companion.record_codec import dumps, loads
+
+DT = 0.01
+Hovering = Callable[..., Facts]
+
+
+def run(
+    state: State, facts: Facts, parameters: Parameters, seconds: float = DT
+) -> tuple[State, list[Commands]]:
+    """Let `seconds` pass with the same facts; requests count once."""
+    said = []
+    t = state.t or 100.0
+    for _ in range(max(round(seconds / DT), 1)):
+        t += DT
+        state, commands = step(state, facts, t, parameters)
+        said.append(commands)
+        facts = dataclasses.replace(facts, requests=())
+    return state, said
+
+
+def answers(said: list[Commands]) -> list[Answer]:
+    return [answer for commands in said for answer in commands.answers]
+
+
+def ask(facts: Facts, order: Order, *values: float) -> Facts:
+    return dataclasses.replace(facts, requests=(Request(7, order, values),))
+
+
+def at(phase: Phase, **memory: object) -> State:
+    fields = {"t": 100.0, "since": 99.0, "control": Control.EXTERNAL, "streaming": True, **memory}
+    return State(phase=phase, reference=Reference((2.0, 0.0, -2.2)), **fields)  # type: ignore[arg-type]
+
+
+ANCHOR = Anchor((2.0, 0.0, -2.2), (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
+
+
+def test_an_arm_found_straight_is_stowed_and_moves_nothing(parameters: Parameters, hovering: Hovering) -> None:
+    state, said = run(State(), hovering(), parameters)
+    assert state.phase is Phase.STOWED
+    assert {commands.arm for commands in said} == {ArmAction.HOLD}
+    assert all(commands.setpoint is None for commands in said)
+
+
+def test_an_arm_found_bent_under_torque_is_left_as_it_is(parameters: Parameters, hovering: Hovering) -> None:
+    state, said = run(State(), hovering((1.2, 0.0)), parameters, 1.0)
+    assert state.phase is Phase.HOLDING
+    assert {commands.arm for commands in said} == {ArmAction.HOLD}
+    assert all(commands.pulls is None and commands.setpoint is None for commands in said)
+
+
+def test_ready_straightens_the_arm_checks_it_and_then_answers(parameters: Parameters, hovering: Hovering) -> None:
+    state, said = run(at(Phase.STOWED), ask(hovering(), Order.READY), parameters, 3.0)
+    assert state.phase is Phase.READY
+    assert [a.result for a in answers(said)] == [Result.IN_PROGRESS, Result.ACCEPTED]
+
+
+def test_torque_that_comes_on_never_jerks_the_arm(parameters: Parameters, hovering: Hovering) -> None:
+    bent = hovering((0.2, 0.1))
+    limp = dataclasses.replace(bent, tendons=tuple(dataclasses.replace(t, torque=False) for t in bent.tendons))
+    _, said = run(at(Phase.STOWED), ask(limp, Order.READY), parameters)
+    first = said[0].pulls
+    assert first is not None
+    assert first == pytest.approx([t.pull for t in bent.tendons], abs=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "words"),
+    [
+        ({"armed": False}, "not flying"),
+        ({"landed": True}, "not flying"),
+        ({"control": Control.PILOT, "mode": "POSCTL"}, "POSCTL"),
+        ({"position_age_s": 1.0}, "old"),
+        ({"heartbeat_age_s": 9.0}, "heartbeat"),
+        ({"position_w": (400.0, 0.0, -2.0)}, "away"),
+    ],
+)
+def test_perch_is_refused_with_the_reason(
+    parameters: Parameters, hovering: Hovering, vehicle: dict[str, object], words: str
+) -> None:
+    facts = ask(hovering(**vehicle), Order.PERCH)
+    state, said = run(at(Phase.READY, control=facts.vehicle.control), facts, parameters)
+    assert state.phase is Phase.READY
+    (answer,) = answers(said)
+    assert answer.result is Result.TEMPORARILY_REJECTED
+    assert words in answer.reason
+
+
+@pytest.mark.parametrize("phase", [Phase.STOWED, Phase.APPROACH, Phase.PERCHED, Phase.HOLDING])
+def test_an_order_that_is_illegal_in_a_phase_changes_nothing(
+    parameters: Parameters, hovering: Hovering, phase: Phase
+) -> None:
+    before = at(phase, anchor=ANCHOR)
+    state, said = run(before, ask(hovering(), Order.PERCH), parameters)
+    assert state.phase is phase
+    assert phase.name in answers(said)[0].reason
+
+
+@pytest.mark.parametrize(
+    ("phase", "after"),
+    [
+        (Phase.APPROACH, Phase.STOWING),
+        (Phase.REACH, Phase.STOWING),
+        (Phase.CONTACT, Phase.RELEASE),
+        (Phase.WRAP, Phase.RELEASE),
+        (Phase.VERIFY, Phase.HOLDING),
+        (Phase.PERCHED, Phase.HOLDING),
+        (Phase.DEPART, Phase.STOWING),
+    ],
+)
+def test_the_pilot_wins_in_the_same_cycle(
+    parameters: Parameters, hovering: Hovering, phase: Phase, after: Phase
+) -> None:
+    facts = hovering(control=Control.PILOT, mode="POSCTL")
+    running = Running(7, Order.PERCH, frozenset({Phase.PERCHED}))
+    state, (commands,) = run(at(phase, anchor=ANCHOR, running=running), facts, parameters)
+    assert commands.setpoint is None
+    assert state.phase is after
+    assert state.errors & ArmFault.PILOT_TOOK_OVER
+    assert [a.result for a in commands.answers] == [Result.FAILED]
+    later, said = run(state, facts, parameters, 5.0)
+    assert all(c.setpoint is None for c in said)
+    assert not later.streaming
+
+
+def test_set_points_do_not_come_back_by_themselves_when_the_pilot_gives_control_back(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    state, _ = run(at(Phase.PERCHED, anchor=ANCHOR), hovering(control=Control.PILOT), parameters)
+    state, said = run(state, hovering(), parameters, 2.0)
+    assert state.phase is Phase.HOLDING
+    assert all(c.setpoint is None for c in said)
+
+
+def test_a_set_point_is_always_complete_and_finite(parameters: Parameters, hovering: Hovering) -> None:
+    for phase in Phase:
+        _, said = run(at(phase, anchor=ANCHOR), hovering(), parameters, 0.1)
+        for commands in said:
+            if (sp := commands.setpoint) is not None:
+                assert all(map(math.isfinite, (*sp.position_w, *sp.velocity_w, *sp.acceleration_w, sp.yaw)))
+
+
+def test_stale_vehicle_state_freezes_the_reference(parameters: Parameters, hovering: Hovering) -> None:
+    before = at(Phase.RELEASE, anchor=ANCHOR, bend=(2.0, 0.0), bend_goal=(0.0, 0.0))
+    state, said = run(before, hovering(position_age_s=2.0, position_w=(9.0, 9.0, 9.0)), parameters, 0.5)
+    assert state.reference == before.reference
+    assert said[-1].setpoint is not None
+
+
+def test_a_silent_servo_ends_the_approach_and_is_told(parameters: Parameters, hovering: Hovering) -> None:
+    facts = hovering()
+    dead = dataclasses.replace(facts.tendons[2], silent=True)
+    facts = dataclasses.replace(facts, tendons=(*facts.tendons[:2], dead, facts.tendons[3]))
+    running = Running(7, Order.PERCH, frozenset({Phase.PERCHED}))
+    state, said = run(at(Phase.APPROACH, running=running), facts, parameters)
+    assert state.phase is Phase.DEPART
+    assert "tendon 3" in answers(said)[0].reason
+
+
+def test_a_silent_servo_never_lets_a_perched_arm_go(parameters: Parameters, hovering: Hovering) -> None:
+    facts = hovering((3.0, 0.0))
+    dead = dataclasses.replace(facts.tendons[0], silent=True, error_bits=0x20)
+    facts = dataclasses.replace(facts, tendons=(dead, *facts.tendons[1:]))
+    held = at(Phase.PERCHED, anchor=ANCHOR, bend=(3.0, 0.0), bend_goal=(3.0, 0.0))
+    state, said = run(held, facts, parameters, 5.0)
+    assert state.phase is Phase.PERCHED
+    assert state.bend == (3.0, 0.0)
+    warnings = [n.text for c in said for n in c.notices]
+    assert sum("hardware error" in text for text in warnings) == 1
+
+
+def test_a_perched_vehicle_is_moved_only_within_the_limit(parameters: Parameters, hovering: Hovering) -> None:
+    held = at(Phase.PERCHED, anchor=ANCHOR)
+    state, said = run(held, ask(hovering(), Order.JOG, 3.0, 0.2, 0.0, 0.0), parameters)
+    assert answers(said)[0].result is Result.TEMPORARILY_REJECTED
+    assert state.offset == (0.0, 0.0, 0.0)
+    state, said = run(held, ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 2.0)
+    assert answers(said)[0].result is Result.ACCEPTED
+    assert state.reference is not None
+    assert state.reference.position == pytest.approx((2.01, 0.0, -2.2))
+
+
+def test_the_feedforward_leans_the_way_that_the_arm_pulls_back(parameters: Parameters, hovering: Hovering) -> None:
+    _, said = run(at(Phase.PERCHED, anchor=ANCHOR), ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 2.0)
+    setpoint = said[-1].setpoint
+    assert setpoint is not None
+    assert setpoint.acceleration_w[0] > 0.1
+    assert math.hypot(*setpoint.acceleration_w) <= parameters.config.limits.feedforward_m_per_s2 + 1e-9
+
+
+def test_a_second_order_cancels_the_first_and_both_are_answered(parameters: Parameters, hovering: Hovering) -> None:
+    state, _ = run(at(Phase.STOWED), ask(hovering(), Order.READY), parameters)
+    facts = dataclasses.replace(hovering(), requests=(Request(8, Order.STOW),))
+    state, said = run(state, facts, parameters, 3.0)
+    assert state.phase is Phase.STOWED
+    assert [(a.request, a.result) for a in answers(said)] == [
+        (7, Result.CANCELLED),
+        (8, Result.IN_PROGRESS),
+        (8, Result.ACCEPTED),
+    ]
+
+
+def test_memory_facts_and_commands_survive_their_text_form_bit_for_bit(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = ask(hovering((0.3, -0.2), position_age_s=math.inf), Order.JOG, 1.0, 0.1, 0.2)
+    state, (commands,) = run(at(Phase.PERCHED, anchor=ANCHOR, errors=ArmFault.SLIP | ArmFault.TIMEOUT), facts, parameters)
+    assert loads(State, dumps(state)) == state
+    assert loads(Facts, dumps(facts)) == facts
+    assert dumps(loads(Commands, dumps(commands))) == dumps(commands)
