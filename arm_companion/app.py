@@ -18,7 +18,7 @@ from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.tendons import Tendons
-from arm_companion.errors import ConfigError
+from arm_companion.errors import ConfigError, DeviceFault
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.perch import FLYING
@@ -114,10 +114,14 @@ class Daemon:
             self._manager.stopping()
             action = SAFE_ACTION[self._state.phase]
             log.info("stopping in %s: the arm will %s", self._state.phase.name, action.value)
-            await self._bus.stop(limp=action is ArmAction.LIMP)
-            for link in self._links:
-                link.close()
-            self._recorder.close()
+            try:
+                await self._bus.stop(limp=action is ArmAction.LIMP)
+            except* DeviceFault as faults:
+                log.error("stopping: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
+            finally:
+                for link in self._links:
+                    link.close()
+                self._recorder.close()
 
     async def _cycles(self) -> None:
         self._manager.ready()

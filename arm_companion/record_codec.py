@@ -9,6 +9,8 @@ import typing
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+UNRECORDED = {"unrecorded": True}
+"""Metadata of a dataclass field that is left out of the text and gets its default when read."""
 
 
 def dumps(value: Any) -> str:
@@ -30,7 +32,7 @@ def loads(cls: type[T], text: str) -> T:
 
 @functools.cache
 def _names(cls: Any) -> tuple[str, ...]:
-    return tuple(f.name for f in dataclasses.fields(cls))
+    return tuple(f.name for f in dataclasses.fields(cls) if f.metadata != UNRECORDED)
 
 
 @functools.cache

@@ -7,7 +7,7 @@ never a cycle.
 import logging
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, TextIO
@@ -127,15 +127,16 @@ def read(path: Path) -> Iterator[Record]:
             yield loads(Record, line)
 
 
-def replay(records: Iterator[Record], parameters: Parameters) -> tuple[int, Record | None]:
-    """Run recorded facts through today's `step`.
+def replay(records: Iterable[Record], parameters: Parameters) -> tuple[int, Record | None]:
+    """Run recorded facts through today's `step`, from the first record's memory on.
 
     Returns:
-        How many cycles were compared, and the first record whose commands differ, if any.
+        How many cycles gave the same commands bit for bit, and the first record that did not, if any.
     """
+    state: State | None = None
     count = 0
     for record in records:
-        _, commands = step(record.state, record.facts, record.t, parameters)
+        state, commands = step(record.state if state is None else state, record.facts, record.t, parameters)
         # the text form compares exactly and treats nan as equal to itself
         if dumps(commands) != dumps(record.commands):
             return count, record

@@ -23,7 +23,7 @@ _ITERATIONS = 50
 _TOLERANCE = 1e-11
 _STEP = 1e-6
 
-_BaseWrench = Callable[[ArmParameters, Array], Array]
+_Solve = Callable[[ArmParameters, Array], ArmSolution]
 
 
 class ArcModel:
@@ -77,11 +77,11 @@ class ArcModel:
         end_mass = P.segments[0].end_mass + (0.0 if payload is None else payload.mass)
         u, residual, iterations = _equilibrium(P, q, _Loads.of(P, g, w, end_mass), start)
 
-        def base(changed: ArmParameters, x: Array) -> Array:
+        def solve(changed: ArmParameters, x: Array) -> ArmSolution:
             n = changed.n
-            return ArcModel(changed).free(x[:n], x[n : n + 3], x[n + 3 :], payload).base_wrench
+            return ArcModel(changed).free(x[:n], x[n : n + 3], x[n + 3 :], payload)
 
-        detail = _Detail(P, u, end_mass, np.zeros(P.n), w, base, np.concatenate((q, g, w)), held=False)
+        detail = _Detail(P, u, end_mass, np.zeros(P.n), w, solve, np.concatenate((q, g, w)), held=False)
         tip, R = arc.tip_position(u, P.L), arc.tip_rotation(u)
         tension = statics.stretch_tension(P, u, q)
         return _solution(detail, q, g, tip, R, tension, residual, iterations, float("nan"))
@@ -108,13 +108,13 @@ class ArcModel:
         K = stiffness.bend_stiffness(P, u, statics.stretch_tension(P, u, q - beyond))
         push = np.concatenate((np.linalg.lstsq(J.T, K @ give, rcond=None)[0], np.zeros(3)))
 
-        def base(changed: ArmParameters, x: Array) -> Array:
+        def solve(changed: ArmParameters, x: Array) -> ArmSolution:
             n = changed.n
             moved = replace(hold, pose=hold.pose.moved(x[n + 3 :]))
-            return ArcModel(changed).held(x[:n], moved, x[n : n + 3]).base_wrench
+            return ArcModel(changed).held(x[:n], moved, x[n : n + 3])
 
         point = np.concatenate((q, g, np.zeros(6)))
-        detail = _Detail(P, u, end_mass, beyond, push, base, point, held=True, whole=self._parameters)
+        detail = _Detail(P, u, end_mass, beyond, push, solve, point, held=True, whole=self._parameters)
         residual = float(np.abs(away - J @ give).max()) / s
         tension = statics.stretch_tension(P, u + give, q - beyond)
         return _solution(detail, q, g, target, hold.pose.rotation, tension, residual, iterations, s - reach)
@@ -151,7 +151,7 @@ class _Detail:
     end_mass: float
     beyond: Array
     tip_wrench: Array
-    base: _BaseWrench
+    solve: _Solve
     point: Array  # pull, gravity, and tip wrench or twist of the hold
     held: bool
     whole: ArmParameters | None = None
@@ -179,22 +179,28 @@ class _Detail:
         """See `Detail.derivatives`."""
         P = self.whole or self.P
         n = P.n
-        D = np.empty((6, self.point.size))
+        D = np.empty((6 + n, self.point.size))
         for j, step in enumerate(_STEP * np.eye(self.point.size)):
-            D[:, j] = (self.base(P, self.point + step) - self.base(P, self.point - step)) / (2 * _STEP)
+            D[:, j] = self._difference((P, self.point + step), (P, self.point - step))
         relative = {}
         for name in ("EI", "GJ", "k_T", "T0"):
             up, down = P.scaled(**{name: 1 + _STEP}), P.scaled(**{name: 1 - _STEP})
-            relative[name] = sealed((self.base(up, self.point) - self.base(down, self.point)) / (2 * _STEP))
+            relative[name] = sealed(self._difference((up, self.point), (down, self.point))[:6])
         tension = statics.stretch_tension(self.P, self.u, self.point[:n] - self.beyond)
         return Derivatives(
-            pull=sealed(D[:, :n].copy()),
-            gravity=sealed(D[:, n : n + 3].copy()),
-            hold=sealed(self.held * D[:, n + 3 :]),
-            tip_wrench=sealed((not self.held) * D[:, n + 3 :]),
+            pull=sealed(D[:6, :n].copy()),
+            gravity=sealed(D[:6, n : n + 3].copy()),
+            hold=sealed(self.held * D[:6, n + 3 :]),
+            tip_wrench=sealed((not self.held) * D[:6, n + 3 :]),
             parameters=relative,
+            tension=sealed(D[6:, n + 3 :].copy()),
             compliance=sealed(stiffness.tip_compliance(self.P, self.u, tension, self.tip_wrench)),
         )
+
+    def _difference(self, up: tuple[ArmParameters, Array], down: tuple[ArmParameters, Array]) -> Array:
+        """Central difference of base wrench and tensions (6 + n,)."""
+        a, b = self.solve(*up), self.solve(*down)
+        return np.concatenate((a.base_wrench - b.base_wrench, a.tension - b.tension)) / (2 * _STEP)
 
 
 def _solution(

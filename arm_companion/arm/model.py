@@ -123,9 +123,11 @@ class Derivatives:
     Attributes:
         pull: (6, n) per m of tendon taken in.
         gravity: (6, 3) per m/s^2.
-        hold: (6, 6) per twist [m; rad] of the held section; zero for a free tip.
+        hold: (6, 6) per twist [m; rad] of what holds the section, about `tip_position`; zero for a free tip.
         tip_wrench: (6, 6) per dead tip wrench [N; N m]; zero for a held tip.
         parameters: (6,) each per relative change of "EI", "GJ", "k_T", "T0".
+        tension: of each tendon (n, 6), N per dead tip wrench [N; N m] of a free tip, or per twist [m; rad] of
+            what holds the section.
         compliance: (6, 6) tip twist [m; rad] per wrench [N; N m] at the end of the modelled part, as if it
             were free there.
     """
@@ -135,6 +137,7 @@ class Derivatives:
     hold: Array
     tip_wrench: Array
     parameters: dict[str, Array]
+    tension: Array
     compliance: Array
 
 

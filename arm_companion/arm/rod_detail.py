@@ -118,11 +118,11 @@ class RodDetail:
         try:
             if support is None:
                 answer = np.linalg.solve(K, np.hstack((-load, J)))
-                compliance = J.T @ answer[:, -6:]
+                compliance, moved = J.T @ answer[:, -6:], answer[:, -6:]
                 D = by_c @ answer
                 hold, tip = np.zeros((6, 6)), D[:, -6:] + direct_tip
             else:
-                D, hold, compliance = self._held(K, load, by_c, J, support, direct_tip)
+                D, hold, compliance, moved = self._held(K, load, by_c, J, support, direct_tip)
                 tip = np.zeros((6, 6))
         except np.linalg.LinAlgError:
             raise NoSolution(float("inf"), "the equilibrium is singular") from None
@@ -135,13 +135,14 @@ class RodDetail:
             hold=sealed(hold),
             tip_wrench=sealed(tip),
             parameters={name: sealed(D[:, n + 3 + k].copy()) for k, name in enumerate(names)},
+            tension=sealed((problem.stiffness * taut)[:, None] * (cables.path @ moved)),
             compliance=sealed(compliance),
         )
 
     def _held(
         self, K: Array, load: Array, by_c: Array, J: Array, support: rod_solver.Support, direct: Array
-    ) -> tuple[Array, Array, Array]:
-        """Base wrench by parameters (6, p) and by hold (6, 6), and the compliance (6, 6)."""
+    ) -> tuple[Array, Array, Array, Array]:
+        """Base wrench by parameters (6, p) and by hold (6, 6), compliance (6, 6), unknowns by hold (size, 6)."""
         state, size = self.solved.state, K.shape[0]
         _, C = support.gap(state)
         k = C.shape[1]
@@ -172,7 +173,7 @@ class RodDetail:
             by_hold = by_hold.copy()
             by_hold[3:, 3:] -= so3.hat(moment)
         compliance = J.T @ np.linalg.solve(K, J)
-        return D[:, : load.shape[1]], by_hold, compliance
+        return D[:, : load.shape[1]], by_hold, compliance, answer[:size, load.shape[1] :]
 
     def _by_gravity(self, state: State) -> tuple[Array, Array]:
         """Work of a unit field on every unknown (size, 3), and the first moment of mass (3,), kg m."""

@@ -20,6 +20,7 @@ hold components x, y, z, x, y along one axis: the vector product is then a[1:4] 
 """
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -105,7 +106,7 @@ class State:
         tip: position of the end (3,), m.
         R_tip: its frame (3, 3).
         m: internal moment (3, q), N m.
-        base_moment: M0 (3,), N m: the moment on the carrier at the base point.
+        base_wrench: N0, M0 (6,), N and N m: force and moment on the carrier at the base point.
         F: resultant of all loads on the end section (3,), N.
         M: their moment about its centre (3,), N m.
         kappa: curvature by coordinate (3, q), 1/m.
@@ -119,13 +120,18 @@ class State:
     tip: Array
     R_tip: Array
     m: Array
-    base_moment: Array
+    base_wrench: Array
     F: Array
     M: Array
     kappa: Array
     cables: Cables
     residual: Array
     J: Array
+
+    @property
+    def tension(self) -> Array:
+        """Of the tendons (n,), N."""
+        return self.cables.tension
 
     @property
     def t(self) -> Array:
@@ -169,6 +175,7 @@ class Rod:
         self._outer = np.column_stack((mesh.outer, mesh.weights))
         self._products = np.ascontiguousarray((mesh.basis[:, None] * mesh.basis[None]).reshape(nb * nb, q).T)
         self._diagonal_index = np.arange(mesh.size) * (mesh.size + 1)
+        self.compiled_newton: Any = None  # of `fast.FastRod`
 
     def _backbone(self, segments: tuple[Segment, ...]) -> None:
         """Modal stiffness (size,): the modes are orthogonal, so it is diagonal."""
@@ -279,7 +286,8 @@ class Rod:
         cables = self._tendons(kappa, c, pull, stiffness)
         residual = self.diagonal * c - projected[:, 6] + cables.tension @ cables.path
         J = projected[:, :6]
-        return State(D, P[:3], PQ[:3, q], R_tip, m, moments[:, q], F, M, kappa, cables, residual, J)
+        base = np.concatenate((F + self.arm_mass * loads.gravity, moments[:, q]))
+        return State(D, P[:3], PQ[:3, q], R_tip, m, base, F, M, kappa, cables, residual, J)
 
     def _tendons(self, kappa: Array, c: Array, pull: Array, stiffness: Array) -> Cables:
         n, nb = stiffness.size, self.mesh.modes

@@ -15,10 +15,11 @@ from arm_companion.errors import LimitViolated, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
-LEVELS = ((5, 3, 13), (8, 5, 18), (12, 8, 26))
+LEVELS = ((5, 3, 12), (8, 5, 18), (12, 8, 26))
 """Discretisations, coarse to fine: degree of the bend modes, of the twist modes, Gauss nodes per segment."""
 
 _NOTHING = Payload(0.0)
+_ZERO = sealed(np.zeros(3))
 
 
 class RodModel:
@@ -29,12 +30,26 @@ class RodModel:
         tolerance: imbalance between the modes (`Rod.imbalance`) above which a finer discretisation is taken;
             tip and base wrench are good to about ten times this.
         refuse: imbalance of the finest discretisation above which the answer is refused.
+        fast: whether to use numba (the extra `fast`). Compiling, or reading the compiled code from numba's
+            cache, is done here and now, and never in flight.
+
+    Raises:
+        ImportError: when `fast` is asked for and numba is not installed.
     """
 
-    def __init__(self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 3e-4) -> None:
+    def __init__(
+        self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 3e-4, fast: bool = False
+    ) -> None:
         self._parameters = parameters
         self._tolerance, self._refuse = tolerance, refuse
+        self._none = sealed(np.zeros(parameters.n))
+        self._slack = sealed(parameters.T0 / parameters.k_T)  # stretch at zero pull
         self._rods: dict[tuple[float, int], Rod] = {}
+        self._make: type[Rod] = Rod
+        if fast:
+            from arm_companion.arm.fast import FastRod  # noqa: PLC0415 - numba is optional, and slow to import
+
+            self._make = FastRod
 
     @property
     def parameters(self) -> ArmParameters:
@@ -86,15 +101,15 @@ class RodModel:
             LimitViolated: where the rod is bent sharper than the tendons' pitch radius.
         """
         load = payload or _NOTHING
-        goal = self._problem(self._parameters.L, pull, gravity, np.zeros(self._parameters.n), load, tension)
+        q = frozen(pull, (self._parameters.n,), "pull")
+        goal = self._problem(self._parameters.L, q, gravity, self._none, load, tension, None)
         if tip_wrench is not None:
             w = frozen(tip_wrench, (6,), "tip_wrench")
             goal.loads.force, goal.loads.moment = w[:3], w[3:]
         if follower_wrench is not None:
             w = frozen(follower_wrench, (6,), "follower_wrench")
             goal.loads.follower_force, goal.loads.follower_moment = w[:3], w[3:]
-        detail = self._solve(self._parameters.L, goal, load, np.zeros(self._parameters.n), start)
-        return _solution(detail, frozen(pull, (self._parameters.n,), "pull"), math.nan)
+        return _solution(self._solve(self._parameters.L, goal, load, self._none, start), q, math.nan)
 
     def held(
         self,
@@ -118,46 +133,53 @@ class RodModel:
             NoSolution: when no stable equilibrium is found on the branch that leads there.
             LimitViolated: when the held section is out of the backbone's reach.
         """
-        detail = self._held(pull, hold, gravity, tension, start)
-        tip = detail.solved.state.tip
-        margin = detail.rod.s - math.sqrt(float(tip @ tip))
-        return _solution(detail, frozen(pull, (self._parameters.n,), "pull"), margin)
+        q = frozen(pull, (self._parameters.n,), "pull")
+        detail = self._held(q, hold, gravity, tension, start)
+        return _solution(detail, q, detail.rod.s - _norm(detail.solved.ends.tip))
 
     def _held(
-        self, pull: ArrayLike, hold: Hold, gravity: ArrayLike, tension: ArrayLike | None, start: ArmSolution | None
+        self, pull: Array, hold: Hold, gravity: ArrayLike, tension: ArrayLike | None, start: ArmSolution | None
     ) -> RodDetail:
-        P = self._parameters
-        s = min(hold.arc_length, P.L)
-        beyond = np.zeros(P.n) if hold.beyond is None else frozen(hold.beyond, (P.n,), "beyond")
+        s = min(hold.arc_length, self._parameters.L)
+        beyond = self._none if hold.beyond is None else frozen(hold.beyond, (self._parameters.n,), "beyond")
         support = _support(hold)
-        reach = float(np.sqrt(support.point @ support.point))
-        slack = float(np.sqrt(hold.pivot @ hold.pivot))
         if hold.kind is HoldKind.CLAMPED:
-            reach, slack = float(np.sqrt(hold.pose.position @ hold.pose.position)), 0.0
-        if reach >= s + slack:
-            raise LimitViolated("distance of the held section from the base", reach, 0.0, s + slack)
-        goal = replace(self._problem(s, pull, gravity, beyond, _NOTHING, tension), support=support)
+            reach, limit = _norm(hold.pose.position), s
+        else:  # only the held point is known, and the section may lie on either side of it
+            reach, limit = _norm(support.point), s + _norm(hold.pivot)
+        if reach >= limit:
+            raise LimitViolated("distance of the held section from the base", reach, 0.0, limit)
+        goal = self._problem(s, pull, gravity, beyond, _NOTHING, tension, support)
         return self._solve(s, goal, _NOTHING, beyond, start)
 
     def anchor(self, hold: Hold, pull: ArrayLike, tension: ArrayLike, gravity: ArrayLike) -> Hold:
         """See `ArmModel.anchor`."""
         P = self._parameters
-        tau = frozen(tension, (P.n,), "tension")
-        detail = self._held(pull, hold, gravity, tau, None)
-        longer = detail.solved.state.cables.longer
-        return replace(hold, beyond=frozen(pull, (P.n,), "pull") + longer - (tau - P.T0) / P.k_T)
+        q, tau = frozen(pull, (P.n,), "pull"), frozen(tension, (P.n,), "tension")
+        detail = self._held(q, hold, gravity, tau, None)
+        return replace(hold, beyond=q + detail.solved.state.cables.longer - (tau - P.T0) / P.k_T)
 
     def _problem(
-        self, s: float, pull: ArrayLike, gravity: ArrayLike, beyond: Array, payload: Payload, tension: ArrayLike | None
+        self,
+        s: float,
+        pull: Array,
+        gravity: ArrayLike,
+        beyond: Array,
+        payload: Payload,
+        tension: ArrayLike | None,
+        support: Support | None,
     ) -> Problem:
         P = self._parameters
         g = frozen(gravity, (3,), "gravity")
-        loads = Loads(g, self._rod(s, 0).end_mass, np.zeros(3), np.zeros(3))
+        loads = Loads(g, self._rod(s, 0).end_mass, _ZERO, _ZERO)
         if payload.mass > 0:
             loads.hung.append((payload.offset, payload.mass * g))
-        if tension is not None:
-            return Problem(np.maximum(frozen(tension, (P.n,), "tension"), 0.0), np.zeros(P.n), loads)
-        return Problem(frozen(pull, (P.n,), "pull") + P.T0 / P.k_T - beyond, P.k_T, loads)
+        if tension is None:
+            return Problem(pull + self._slack - beyond, P.k_T, loads, support)
+        tau = frozen(tension, (P.n,), "tension")
+        if tau.min() < 0:
+            raise LimitViolated("tendon tension", float(tau.min()), 0.0, math.inf)
+        return Problem(tau, self._none, loads, support)
 
     def _rod(self, s: float, level: int) -> Rod:
         """Tables up to arc length s, kept: they depend on nothing else."""
@@ -166,7 +188,7 @@ class RodModel:
         if rod is None:
             if len(self._rods) >= 64:  # a hold that wanders along the arm must not fill the memory
                 self._rods.clear()
-            rod = self._rods[key] = Rod(self._parameters, s, *LEVELS[level])
+            rod = self._rods[key] = self._make(self._parameters, s, *LEVELS[level])
         return rod
 
     def _solve(self, s: float, goal: Problem, payload: Payload, beyond: Array, start: ArmSolution | None) -> RodDetail:
@@ -174,87 +196,115 @@ class RodModel:
         level, solved = self._from(s, goal, start)
         while True:
             rod = self._rod(s, level)
-            imbalance = rod.imbalance(solved.state)
+            imbalance = rod.imbalance(solved.state) if solved.imbalance is None else solved.imbalance
             if imbalance <= self._tolerance or level + 1 == len(LEVELS):
                 break
             level += 1
-            finer = rod_solver.newton(
-                self._rod(s, level), goal, _padded(solved.c, rod, self._rod(s, level)), solved.wrench
-            )
-            if finer is None or not rod_solver.is_stable(self._rod(s, level), finer):
-                raise NoSolution(imbalance, "a finer discretisation does not confirm the equilibrium")
-            finer.iterations += solved.iterations
-            solved = finer
-        if imbalance > self._refuse:
+            solved = self._refined(rod, self._rod(s, level), goal, solved, imbalance)
+        if not imbalance <= self._refuse:
             raise NoSolution(imbalance, "the backbone bends sharper than the finest discretisation can show")
         solved.residual = max(solved.residual, imbalance)
         return RodDetail(rod, solved, payload, beyond, level, imbalance < 1e-3 * self._tolerance)
 
+    @staticmethod
+    def _refined(rod: Rod, finer: Rod, goal: Problem, solved: Solved, imbalance: float) -> Solved:
+        """The same equilibrium with more modes.
+
+        Raises:
+            NoSolution: when that is another one, or none.
+        """
+        found = rod_solver.newton(finer, goal, _padded(solved.c, rod, finer), solved.wrench)
+        if isinstance(found, str) or not rod_solver.is_stable(finer, found):
+            raise NoSolution(imbalance, "a finer discretisation does not confirm the equilibrium")
+        found.iterations += solved.iterations
+        return found
+
     def _from(self, s: float, goal: Problem, start: ArmSolution | None) -> tuple[int, Solved]:
-        if start is not None and isinstance(start.detail, RodDetail):
-            detail = start.detail
-            if detail.rod.s == s and _same_kind(detail.solved.problem, goal):
-                level = max(0, detail.level - detail.easy)
-                rod = self._rod(s, level)
+        """A solution and its level: from the start given, or from the unloaded arm.
+
+        Near the taut limit few modes cannot follow the branch, so what fails is tried again with more.
+        """
+        detail = None if start is None else start.detail
+        if not isinstance(detail, RodDetail) or detail.rod.s != s or not _same_kind(detail.solved.problem, goal):
+            detail = None
+        lowest = 0 if detail is None else max(0, detail.level - detail.easy)
+        for level in range(lowest, len(LEVELS)):
+            rod = self._rod(s, level)
+            try:
+                if detail is None:
+                    return level, self._cold(rod, goal)
                 begin = detail.solved
                 if rod is not detail.rod:
-                    begin = self._restated(rod, begin, _padded(begin.c, detail.rod, rod))
+                    begin = _at(rod, begin.problem, _padded(begin.c, detail.rod, rod), begin.wrench)
                 return level, rod_solver.follow(rod, begin, goal, "from the solution given")
-        return 0, self._cold(s, goal)
+            except NoSolution:
+                if level + 1 == len(LEVELS):
+                    raise
+        raise NoSolution(math.inf, "no discretisation")
 
-    def _cold(self, s: float, goal: Problem) -> Solved:
+    def _cold(self, rod: Rod, goal: Problem) -> Solved:
         """From the unloaded arm, whose segments are exact arcs, to the free arm, and on to what holds it."""
-        rod = self._rod(s, 0)
         c = np.zeros(rod.mesh.size)
         modes, count = rod.mesh.modes, len(rod.mesh.lengths)
         u = self._unloaded(rod, goal)
         c[:count], c[modes : modes + count] = u[0::2], u[1::2]
-        nothing = Loads(np.zeros(3), goal.loads.end_mass, np.zeros(3), np.zeros(3))
-        unloaded = self._restated(rod, None, c, Problem(goal.pull, goal.stiffness, nothing))
+        nothing = Loads(_ZERO, goal.loads.end_mass, _ZERO, _ZERO)
+        unloaded = _at(rod, Problem(goal.pull, goal.stiffness, nothing), c, np.zeros(0))
         free = rod_solver.follow(rod, unloaded, replace(goal, support=None), "loading")
         if goal.support is None:
             return free
-        begin = rod_solver.grip(free, goal)
-        held = rod_solver.follow(rod, begin, goal, "moving the held section")
+        held = rod_solver.follow(rod, rod_solver.grip(free, goal), goal, "moving the held section")
         held.iterations += free.iterations
         return held
 
     def _unloaded(self, rod: Rod, goal: Problem) -> Array:
         """Bends (2 m,) of the pieces without load, rad."""
-        P = self._parameters
-        part = P.up_to(rod.s)
-        if goal.stiffness.any():
-            return statics.bend_for_pull(part, goal.pull - P.T0 / P.k_T)
-        return np.asarray((goal.pull @ part.H) / (part.bending - 2 * goal.pull @ part.chord_loss))
+        part = self._parameters.up_to(rod.s)
+        locked = bool(goal.stiffness[0] > 0)
+        if locked:
+            u = statics.bend_for_pull(part, goal.pull - self._slack)
+            tension = statics.stretch_tension(part, u, goal.pull - self._slack)
+        else:
+            u, tension = np.zeros(part.H.shape[1]), goal.pull
+        # What the chords between the disks leave of the stiffness.
+        stiffness = part.bending - 2 * tension @ part.chord_loss
+        if stiffness.min() <= 0:
+            raise LimitViolated("sum of tensions", float(tension.sum()), 0.0, _buckling_tension(part))
+        return u if locked else np.asarray(tension @ part.H / stiffness)
 
-    @staticmethod
-    def _restated(rod: Rod, old: Solved | None, c: Array, problem: Problem | None = None) -> Solved:
-        """A starting point: another's unknowns on this rod, not an equilibrium of it yet."""
-        at = problem if old is None else old.problem
-        if at is None:
-            raise ValueError("neither a solution nor a problem")
-        wrench = np.zeros(0) if old is None else old.wrench
-        loads = at.loads_with(wrench)
-        state = rod.evaluate(c, loads, at.pull, at.stiffness)
-        return Solved(c, wrench, state, loads, at, 0, math.inf)
+
+def _at(rod: Rod, problem: Problem, c: Array, wrench: Array) -> Solved:
+    """A place to start from: given unknowns on this rod, not an equilibrium of it yet."""
+    state = rod.evaluate(c, problem.loads_with(wrench), problem.pull, problem.stiffness)
+    return Solved(rod, problem, c, wrench, state, 0, math.inf)
 
 
 def _support(hold: Hold) -> Support:
-    point = hold.pose @ hold.pivot
+    point = hold.pose @ hold.pivot if any(hold.pivot.tolist()) else hold.pose.position
     if hold.kind is HoldKind.PINNED:
         return Support(hold.pivot, point)
     return Support(hold.pivot, point, hold.pose.rotation, hold.axis)
 
 
+def _buckling_tension(part: ArmParameters) -> float:
+    """Sum of tensions, N, at which chords between the disks take all stiffness: 12 EI / l_d^2."""
+    return min(12 * g.EI * (g.disks / g.L) ** 2 for g in part.segments)
+
+
+def _norm(v: Array) -> float:
+    x, y, z = v.tolist()
+    return math.sqrt(x * x + y * y + z * z)
+
+
 def _same_kind(old: Problem, new: Problem) -> bool:
     """Whether a solution of one problem is a place to start the other from."""
-    if old.stiffness.any() != new.stiffness.any() or (old.support is None) != (new.support is None):
+    a, b = old.support, new.support
+    if (old.stiffness[0] > 0) != (new.stiffness[0] > 0):
         return False
-    if old.support is None or new.support is None:
-        return True
-    return old.support.moments.shape == new.support.moments.shape and bool(
-        (old.support.pivot == new.support.pivot).all()
-    )
+    if a is None or b is None:
+        return a is b
+    alike = (a.R is None) == (b.R is None) and (a.axis is None) == (b.axis is None)
+    return alike and a.pivot.tolist() == b.pivot.tolist()
 
 
 def _padded(c: Array, old: Rod, new: Rod) -> Array:
@@ -268,38 +318,39 @@ def _padded(c: Array, old: Rod, new: Rod) -> Array:
 
 
 def _solution(detail: RodDetail, pull: Array, margin: float) -> ArmSolution:
-    rod, solved, state = detail.rod, detail.solved, detail.solved.state
-    gravity = solved.problem.loads.gravity
-    base = np.empty(6)
-    base[:3] = state.F + rod.arm_mass * gravity
-    base[3:] = state.base_moment
-    support, loads = solved.problem.support, solved.problem.loads
-    tip = np.empty(6)
-    if support is None:
-        tip[:3], tip[3:] = loads.force, loads.moment
-        if loads.follower_force is not None and loads.follower_moment is not None:
-            tip[:3] += state.R_tip @ loads.follower_force
-            tip[3:] += state.R_tip @ loads.follower_moment
-    else:
-        tip[:3] = solved.wrench[:3]
-        tip[3:] = solved.wrench[3:] @ support.moments
-        if not support.central:
-            tip[3:] += so3.cross(state.R_tip @ support.pivot, solved.wrench[:3])
+    rod, solved, ends = detail.rod, detail.solved, detail.solved.ends
     count, modes = len(rod.mesh.lengths), rod.mesh.modes
-    bend = np.column_stack((solved.c[:count], solved.c[modes : modes + count])).reshape(-1)
+    bend = np.empty(2 * count)
+    bend[0::2], bend[1::2] = solved.c[:count], solved.c[modes : modes + count]
     return ArmSolution(
         pull=pull,
         bend=sealed(bend),
-        tip_position=sealed(state.tip),
-        tip_rotation=sealed(state.R_tip.copy()),
-        tension=sealed(state.cables.tension),
-        base_wrench=sealed(base),
-        tip_wrench=sealed(tip),
+        tip_position=sealed(ends.tip),
+        tip_rotation=sealed(ends.R_tip),
+        tension=sealed(ends.tension),
+        base_wrench=sealed(ends.base_wrench),
+        tip_wrench=sealed(_tip_wrench(solved)),
         residual=solved.residual,
         taut_margin=margin,
-        gravity=gravity,
+        gravity=solved.problem.loads.gravity,
         arc_length=rod.s,
         coordinates=sealed(solved.c),
         iterations=solved.iterations,
         detail=detail,
     )
+
+
+def _tip_wrench(solved: Solved) -> Array:
+    """What the outside exerts on the end section (6,), about its centre, payload left out."""
+    support, loads, R = solved.problem.support, solved.problem.loads, solved.ends.R_tip
+    if support is None:
+        w = np.concatenate((loads.force, loads.moment))
+        if loads.follower_force is not None and loads.follower_moment is not None:
+            w += np.concatenate((R @ loads.follower_force, R @ loads.follower_moment))
+        return w
+    if support.central and support.R is not None and support.axis is None:
+        return solved.wrench.copy()
+    moment = so3.cross(R @ support.pivot, solved.wrench[:3])
+    if support.R is not None:
+        moment = moment + solved.wrench[3:] @ support.moments
+    return np.concatenate((solved.wrench[:3], moment))

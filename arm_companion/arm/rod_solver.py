@@ -8,6 +8,7 @@ is stable (the tangent is positive on all motions that the support allows).
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 
@@ -19,13 +20,20 @@ from arm_companion.geometry.arrays import Array
 TOLERANCE = 1e-9
 """Of residual and constraint, relative to the rod's own moment and length."""
 
-_ITERATIONS = 25
-_STEP_LIMIT = 0.6  # rad, of any curvature mode in one Newton step
+TOO_SHARP = "a bend sharper than the tendons' pitch radius"
+NO_CONVERGENCE = "no convergence: the arm snaps, or is taut"
+"""Why Newton gives up."""
+
+ITERATIONS = 25
+STEP_LIMIT = 0.6
+"""Of any curvature mode in one Newton step, rad."""
+
 _BRANCH = 0.8  # rad, that a mode may move in one homotopy step
 _SMALLEST_STEP = 1 / 512
 _STIFFEN = 1e4  # of forbidden motions, when only the allowed ones are to be judged
 _NO_DIRECTION = np.zeros((0, 3))
 _EYE = np.eye(3)
+_ORIGIN = [0.0, 0.0, 0.0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +55,7 @@ class Support:
     @cached_property
     def central(self) -> bool:
         """Whether the section is held at its own centre."""
-        return not self.pivot.any()
+        return bool(self.pivot.tolist() == _ORIGIN)
 
     @cached_property
     def moments(self) -> Array:
@@ -130,35 +138,63 @@ class Problem:
         return Loads(loads.gravity, loads.end_mass, force, moment, *turning, hung)
 
 
+class Ends(Protocol):
+    """The part of a `State` that every caller needs."""
+
+    tip: Array
+    R_tip: Array
+    base_wrench: Array
+
+    @property
+    def tension(self) -> Array:
+        """Of the tendons (n,), N."""
+
+
 @dataclass(eq=False)
 class Solved:
     """An equilibrium.
 
     Attributes:
+        rod: what was solved on.
+        problem: what was solved.
         c: unknowns (size,).
         wrench: multipliers (k,): force at the held point [N], then moments along `Support.moments` [N m].
-        state: the rod there.
-        loads: with the support's forces among them.
-        problem: what was solved.
+        ends: the rod's ends and tensions there.
         iterations: Newton steps taken, all in all.
         residual: of Newton's own stop test.
         tangent: from the last Newton step, so a little old; None when there was none.
         held: derivative of the support's constraints (size, k); None without a support.
+        stable: whether it is; None when that was not looked at.
+        imbalance: between the modes; None when that was not looked at.
     """
 
+    rod: Rod
+    problem: Problem
     c: Array
     wrench: Array
-    state: State
-    loads: Loads
-    problem: Problem
+    ends: Ends
     iterations: int
     residual: float
     tangent: Array | None = None
     held: Array | None = None
+    stable: bool | None = None
+    imbalance: float | None = None
+
+    @property
+    def loads(self) -> Loads:
+        """The problem's loads with the support's forces among them."""
+        return self.problem.loads_with(self.wrench)
+
+    @cached_property
+    def state(self) -> State:
+        """The whole state."""
+        if isinstance(self.ends, State):
+            return self.ends
+        return self.rod.evaluate(self.c, self.loads, self.problem.pull, self.problem.stiffness)
 
 
-def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array | None = None) -> Solved | None:
-    """Newton from a guess; None when it does not converge.
+def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array | None = None) -> Solved | str:
+    """Newton from a guess; the reason in words when it does not converge.
 
     Args:
         rod: tables.
@@ -167,63 +203,68 @@ def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array |
         wrench: guess of the support's forces (k,).
         tangent: of a neighbouring solution, good enough for the first step.
     """
+    if rod.compiled_newton is not None:
+        found: Solved | str = rod.compiled_newton(problem, c, wrench, tangent)
+        return found
     support, L, last = problem.support, rod.s, math.inf
-    K = tangent
-    gap: Array | None = None
-    C: Array | None = None
-    for iteration in range(_ITERATIONS):
+    K, C = tangent, None
+    for iteration in range(ITERATIONS):
         loads = problem.loads_with(wrench)
         try:
             state = rod.evaluate(c, loads, problem.pull, problem.stiffness)
         except LimitViolated:
-            return None
-        size = rod.moment_scale
-        error = float(np.abs(state.residual).max())
-        if support is not None:
-            size += float(np.abs(wrench).max()) * L
-            gap, C = support.gap(state)
-            error = max(error / size, float(np.abs(gap[:3]).max()) / L, float(np.abs(gap[3:]).max(initial=0.0)))
+            return TOO_SHARP
+        gap: Array | None = None
+        error = _largest(state.residual)
+        if support is None:
+            error /= rod.moment_scale
         else:
-            error /= size
+            gap, C = support.gap(state)
+            error /= rod.moment_scale + _largest(wrench) * L
+            error = max(error, _largest(gap[:3]) / L, _largest(gap[3:]))
         if error < TOLERANCE:
-            return Solved(c, wrench, state, loads, problem, iteration, error, K, C)
+            return Solved(rod, problem, c, wrench, state, iteration, error, K, C)
         if not error < 1e3 * max(last, 1e-3):
-            return None
+            return NO_CONVERGENCE
         last = error
         if K is None or iteration > 0:
             K = rod.tangent(state, loads, problem.stiffness)
         try:
             if support is None or gap is None or C is None:
-                step, push = np.linalg.solve(K, state.residual), wrench
+                step, push = np.asarray(np.linalg.solve(K, state.residual)), wrench
             else:
                 step, push = _saddle_step(K, state.residual, gap, C, support.forces(state), L)
         except np.linalg.LinAlgError:
-            return None
-        largest = float(np.abs(step).max())
-        share = 1.0 if largest < _STEP_LIMIT else _STEP_LIMIT / largest
+            return NO_CONVERGENCE
+        largest = _largest(step)
+        share = 1.0 if largest < STEP_LIMIT else STEP_LIMIT / largest
         c = c - share * step
         wrench = wrench - share * push
-    return None
+    return NO_CONVERGENCE
+
+
+def _largest(values: Array) -> float:
+    """Largest magnitude of a short vector, 0 of an empty one; faster than NumPy on a dozen entries."""
+    return max(map(abs, values.tolist()), default=0.0)
 
 
 def _saddle_step(K: Array, residual: Array, gap: Array, C: Array, forces: Array, L: float) -> tuple[Array, Array]:
     """Newton step of curvature and multipliers together; forces are scaled by the length."""
     n, k = C.shape
+    scale = np.ones(k)
+    scale[:3] = L
     A = np.zeros((n + k, n + k))
     A[:n, :n] = K
-    A[n:, :n] = C.T
-    np.negative(forces, out=A[:n, n:])
-    A[n : n + 3] /= L
-    A[:, n : n + 3] /= L
-    right = np.concatenate((residual, gap))
-    right[n : n + 3] /= L
-    step = np.linalg.solve(A, right)
-    step[n : n + 3] /= L
-    return np.asarray(step[:n]), np.asarray(step[n:])
+    np.divide(C.T, scale[:, None], out=A[n:, :n])
+    np.divide(forces, -scale, out=A[:n, n:])
+    step = np.linalg.solve(A, np.concatenate((residual, gap / scale)))
+    return np.asarray(step[:n]), np.asarray(step[n:] / scale)
 
 
 def is_stable(rod: Rod, solved: Solved) -> bool:
     """Whether every motion that the support allows costs energy (second variation positive)."""
+    if solved.stable is not None:
+        return solved.stable
     if solved.tangent is None:
         solved.tangent = rod.tangent(solved.state, solved.loads, solved.problem.stiffness)
     K = 0.5 * (solved.tangent + solved.tangent.T)
@@ -270,13 +311,13 @@ def follow(rod: Rod, start: Solved, goal: Problem, what: str) -> Solved:
         problem = goal if to >= 1.0 else between(here, goal, (to - done) / (1 - done))
         found = newton(rod, problem, here.c, _carried(here, problem), here.tangent)
         reason = ""
-        if found is None:
-            reason = "no convergence"
-        elif float(np.abs(found.c - here.c).max()) > _BRANCH:
+        if isinstance(found, str):
+            reason = found
+        elif _largest(found.c - here.c) > _BRANCH:
             reason = "another branch"
         elif not is_stable(rod, found):
             reason = "the arm buckles or snaps"
-        if found is None or reason:
+        if isinstance(found, str) or reason:
             step = 0.5 * (to - done)
             if step < _SMALLEST_STEP:
                 raise NoSolution(here.residual, f"{what}: {reason} at {100 * done:.1f} % of the way")
@@ -290,10 +331,10 @@ def follow(rod: Rod, start: Solved, goal: Problem, what: str) -> Solved:
 
 def grip(free: Solved, goal: Problem) -> Solved:
     """The free arm, with the goal's support put on it where it is and exerting nothing yet."""
-    support = _support_between(free.state, goal.support, 0.0)
+    support = _support_between(free.ends, goal.support, 0.0)
     k = 0 if support is None else support.components
     problem = replace(free.problem, support=support)
-    return Solved(free.c, np.zeros(k), free.state, free.loads, problem, 0, free.residual, free.tangent)
+    return Solved(free.rod, problem, free.c, np.zeros(k), free.ends, 0, free.residual, free.tangent)
 
 
 def _carried(here: Solved, problem: Problem) -> Array:
@@ -325,26 +366,26 @@ def between(start: Solved, goal: Problem, x: float) -> Problem:
         hung=hung,
     )
     pull = (1 - x) * start.problem.pull + x * goal.pull
-    return Problem(pull, goal.stiffness, loads, _support_between(start.state, goal.support, x))
+    return Problem(pull, goal.stiffness, loads, _support_between(start.ends, goal.support, x))
 
 
-def _support_between(state: State, goal: Support | None, x: float) -> Support | None:
-    """The support at share x of the way from where the state is."""
+def _support_between(ends: Ends, goal: Support | None, x: float) -> Support | None:
+    """The support at share x of the way from where the end is."""
     if goal is None:
         return None
-    here = state.tip + state.R_tip @ goal.pivot
+    here = ends.tip + ends.R_tip @ goal.pivot
     point = (1 - x) * here + x * goal.point
     if goal.R is None:
         return Support(goal.pivot, point)
     if goal.axis is None:
-        R = so3.exp(x * so3.log(goal.R @ state.R_tip.T)) @ state.R_tip
+        R = so3.exp(x * so3.log(goal.R @ ends.R_tip.T)) @ ends.R_tip
         return Support(goal.pivot, point, R)
     # The shortest turn that lays the bar's axis, as the section sees it now, on where it is to be.
-    now = state.R_tip @ (goal.R.T @ goal.axis)
+    now = ends.R_tip @ (goal.R.T @ goal.axis)
     turn = so3.cross(now, goal.axis)
     sine = math.sqrt(float(turn @ turn))
     if sine < 1e-12:
-        return Support(goal.pivot, point, state.R_tip, now)
+        return Support(goal.pivot, point, ends.R_tip, now)
     part = so3.exp(turn * (x * math.atan2(sine, float(now @ goal.axis)) / sine))
     axis = part @ now
-    return Support(goal.pivot, point, part @ state.R_tip, axis / math.sqrt(float(axis @ axis)))
+    return Support(goal.pivot, point, part @ ends.R_tip, axis / math.sqrt(float(axis @ axis)))

@@ -7,7 +7,7 @@ import sys
 
 from arm_companion.app import Daemon, open_configured
 from arm_companion.cli.common import add_config_arguments, load_from
-from arm_companion.clock import Clock, unix_now
+from arm_companion.clock import Clock, precise_loop, unix_now
 from arm_companion.supervisor import ServiceManager, stop_on_signals
 
 
@@ -37,5 +37,6 @@ def run(arguments: argparse.Namespace) -> int:
             restore()
             manager.close()
 
-    asyncio.run(main())
+    with asyncio.Runner(loop_factory=precise_loop) as runner:
+        runner.run(main())
     return 0

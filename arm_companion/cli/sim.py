@@ -96,13 +96,15 @@ def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> 
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+    from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     path = _record_path(arguments)
     words = ["run", "--config", arguments.config]
     for setting in (*arguments.settings, f'record.file="{path.resolve()}"'):
         words += ["--set", setting]
-    return asyncio.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+    with asyncio.Runner(loop_factory=precise_loop) as runner:
+        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
 
 
 def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:

@@ -76,7 +76,7 @@ class MountConfig:
 
     position_m: tuple[float, ...] = option(
         "arm base from the airframe's centre of mass, body axes (FRD)",
-        (0.0, 0.0, 0.08),
+        (0.0, 0.0, 0.12),
         unit="m",
         lower=-2.0,
         upper=2.0,
@@ -165,7 +165,7 @@ class LimitsConfig:
     wrench_force_n: float = option("predicted force on the airframe", 12.0, unit="N", lower=0.1, upper=500.0)
     wrench_moment_nm: float = option("predicted moment on the airframe", 2.5, unit="N m", lower=0.01, upper=200.0)
     vehicle_speed_m_per_s: float = option("set-point speed near the bar", 0.3, unit="m/s", lower=0.01, upper=5.0)
-    feedforward_m_per_s2: float = option("acceleration feed-forward", 2.5, unit="m/s^2", lower=0.0, upper=8.0)
+    feedforward_m_per_s2: float = option("acceleration feed-forward", 3.5, unit="m/s^2", lower=0.0, upper=8.0)
 
 
 @dataclass(frozen=True)
@@ -183,35 +183,45 @@ class PerchConfig:
     bar_axis_deg: float = option(
         "heading of the bar's axis, clockwise from north", 90.0, unit="deg", lower=-180.0, upper=180.0
     )
-    bar_radius_m: float = option("radius of the bar", 0.015, unit="m", lower=0.002, upper=0.5)
-    contact_arc_m: float = option("arc length at which the arm meets the bar", 0.11, unit="m", lower=0.01, upper=3.0)
+    bar_radius_m: float = option("radius of the bar", 0.035, unit="m", lower=0.002, upper=0.5)
+    contact_arc_m: float = option("arc length at which the arm meets the bar", 0.06, unit="m", lower=0.01, upper=3.0)
     disk_radius_m: float = option("outer radius of the disks", 0.023, unit="m", lower=0.001, upper=0.3)
     standoff_m: float = option(
-        "horizontal distance from the bar at which the approach ends", 0.4, unit="m", lower=0.05, upper=5.0
+        "horizontal distance from the bar at which the approach ends", 0.6, unit="m", lower=0.05, upper=5.0
     )
     approach_speed_m_per_s: float = option("towards the stand-off", 0.5, unit="m/s", lower=0.02, upper=3.0)
-    reach_speed_m_per_s: float = option("towards the bar", 0.08, unit="m/s", lower=0.01, upper=0.5)
+    reach_speed_m_per_s: float = option("towards the bar", 0.04, unit="m/s", lower=0.01, upper=0.5)
     overreach_m: float = option(
         "how far past the expected contact to look for the bar", 0.06, unit="m", lower=0.0, upper=0.5
     )
     contact_force_n: float = option(
         "horizontal force on the vehicle, beyond the free arm's, that means contact",
-        0.6,
+        0.35,
         unit="N",
         lower=0.05,
         upper=20.0,
     )
-    wrap_bend_rad: float = option("commanded bend of the full wrap", 4.6, unit="rad", lower=0.5, upper=12.0)
+    wrap_bend_rad: float = option("commanded bend of the full wrap", 4.7, unit="rad", lower=0.5, upper=12.0)
+    free_arc_m: float = option(
+        "effective arc length between base and bar of the wrapped arm, which acts as a spring",
+        0.18,
+        unit="m",
+        lower=0.01,
+        upper=3.0,
+    )
+    wrap_clearance_m: float = option(
+        "how far the vehicle stays clear of the bar when the wrap begins", 0.03, unit="m", lower=0.0, upper=0.3
+    )
     bend_speed_rad_per_s: float = option("bending and unbending", 0.9, unit="rad/s", lower=0.01, upper=10.0)
     grip_tension_n: float = option(
-        "tension of the tightest tendon that means gripped", 18.0, unit="N", lower=1.0, upper=200.0
+        "tension of the tightest tendon that means gripped", 12.0, unit="N", lower=1.0, upper=200.0
     )
     verify_pull_m: float = option("set-point offset of the pull test", 0.05, unit="m", lower=0.005, upper=0.5)
     verify_give_share: float = option(
         "share of that offset which a good grip gives at most", 0.5, lower=0.05, upper=0.95
     )
     jog_max_m: float = option("largest move of the anchored vehicle", 0.03, unit="m", lower=0.001, upper=0.2)
-    contact_timeout_s: float = option("time for the reach", 25.0, unit="s", lower=1.0, upper=300.0)
+    contact_timeout_s: float = option("time for the reach", 40.0, unit="s", lower=1.0, upper=300.0)
     state_timeout_s: float = option("time for any other moving state", 30.0, unit="s", lower=1.0, upper=600.0)
 
 
@@ -241,7 +251,7 @@ class SimBarConfig:
         "point on the axis, world NED", (3.0, 0.0, -2.0), unit="m", lower=-100.0, upper=100.0, length=3
     )
     axis_deg: float = option("heading of the axis", 90.0, unit="deg", lower=-180.0, upper=180.0)
-    radius_m: float = option("radius", 0.015, unit="m", lower=0.002, upper=0.2)
+    radius_m: float = option("radius", 0.035, unit="m", lower=0.002, upper=0.2)
     friction: float = option("Coulomb coefficient against the arm", 0.8, lower=0.0, upper=3.0)
 
 

@@ -263,7 +263,7 @@ class ServoBus:
             await self._for_each("torque off", holding, self._switch_off)
 
     async def _switch_off(self, record: ServoRecord) -> None:
-        await self._link.write(record.id, ct.TORQUE_ENABLE, 0)
+        await self._link.write(record.id, ct.TORQUE_ENABLE, 0, tries=1 if record.missed else _TRIES)
         record.torque = False
         record.goal = None
 

@@ -16,8 +16,9 @@ from arm_companion.transport.base import Transport
 _BITS_PER_BYTE = 10
 _TURNAROUND_S = 50e-6  # a servo's own time to begin an answer
 _TRIES = 4
-_DRAIN_S = 0.004
+_DRAIN_S = 0.02  # longer than the latency timer of an adapter as it comes from the factory
 _LATE_S = 0.005
+_LATEST_S = 0.1  # what comes later answers nothing any more
 
 
 class Latency:
@@ -100,8 +101,7 @@ class ServoLink:
             fits = len(packet.parameters) == self._size or packet.error & ~dxl.ALERT
             if self._waiting is None or packet.id not in self._wanted or not fits:
                 self.strays += 1
-                if packet.id in self._owed:  # late, and so a lesson
-                    self.latency.learn(asyncio.get_running_loop().time() - self._owed.pop(packet.id))
+                self._learn_from_late(packet.id)
                 continue
             self._answers[packet.id] = packet
             # Servos answer in the order of the request: after the last one nobody will.
@@ -120,16 +120,15 @@ class ServoLink:
         async with self._lock:
             loop = asyncio.get_running_loop()
             begin = loop.time()
-            if self._transport is None or not servos or begin >= deadline:
+            wire = self._end_of_line(begin, len(request) + len(servos) * (size + dxl.STATUS_OVERHEAD))
+            for servo in servos:
+                wire += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
+            if self._transport is None or not servos or wire > deadline:
                 return {}
             self.parser.reset()
             self._wanted, self._size, self._answers = servos, size, {}
             self._waiting = loop.create_future()
             self._transport.write(request)
-            self._occupy(begin, len(request) + len(servos) * (size + dxl.STATUS_OVERHEAD))
-            for servo in servos:
-                self._line_free_at += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
-            wire = self._line_free_at
             timer = loop.call_at(min(wire + self.latency.margin_s, deadline), self._finish)
             try:
                 await self._waiting
@@ -137,16 +136,13 @@ class ServoLink:
                 timer.cancel()
                 self._waiting = None
             end = loop.time()
-            self._line_free_at = min(self._line_free_at, end)
-            unambiguous = not any(servo in self._owed for servo in servos)
+            self._line_free_at = min(wire, end)
             if len(self._answers) == len(servos):
-                if unambiguous:
+                if not self._owed:
                     self.latency.learn(max(end - wire, 0.0))
                 self._owed.clear()
             else:
-                for servo in servos:
-                    if servo not in self._answers:
-                        self._owed.setdefault(servo, wire)
+                self._owed |= {servo: wire for servo in servos if servo not in self._answers}
             return self._answers
 
     async def tell(self, request: bytes) -> None:
@@ -154,17 +150,19 @@ class ServoLink:
         async with self._lock:
             if self._transport is not None:
                 self._transport.write(request)
-                self._occupy(asyncio.get_running_loop().time(), len(request))
+                self._line_free_at = self._end_of_line(asyncio.get_running_loop().time(), len(request))
 
-    async def command(self, servo: int, request: bytes, size: int = 0) -> bytes:
+    async def command(self, servo: int, request: bytes, size: int = 0, tries: int = _TRIES) -> bytes:
         """Data of one servo's answer; asks again when none comes.
 
-        Answers carry no number: before asking again, a late one is given time to come and be dropped.
+        Answers carry no number: before it asks again, a late one is given time to come and be dropped.
 
         Raises:
             DeviceFault: when it stays silent, or refuses.
         """
-        for attempt in range(_TRIES):
+        for attempt in range(tries):
+            if attempt:
+                await asyncio.sleep(_DRAIN_S)
             deadline = asyncio.get_running_loop().time() + self._timeout_s
             answers = await self.ask(request, (servo,), size, deadline)
             if servo in answers:
@@ -174,7 +172,6 @@ class ServoLink:
                 return answers[servo].parameters
             if not self.connected:
                 raise DeviceFault(servo, 0, "the bus is not connected")
-            await asyncio.sleep(_DRAIN_S * 2**attempt)
         late = self.latency.mean_s
         hint = f"; answers come {late * 1e3:.0f} ms late: see the adapter's latency timer" if late > _LATE_S else ""
         raise DeviceFault(servo, 0, "does not answer" + hint)
@@ -188,19 +185,27 @@ class ServoLink:
         data = await self.command(servo, dxl.read(servo, register.address, register.size), register.size)
         return register.decode(data)
 
-    async def write(self, servo: int, register: Register, value: int) -> None:
+    async def write(self, servo: int, register: Register, value: int, tries: int = _TRIES) -> None:
         """Set a register, and have it acknowledged.
 
         Raises:
             DeviceFault: when the servo stays silent, or refuses.
         """
         try:
-            await self.command(servo, dxl.write(servo, register.address, register.encode(value)))
+            await self.command(servo, dxl.write(servo, register.address, register.encode(value)), tries=tries)
         except DeviceFault as fault:
             raise DeviceFault(servo, 0, f"{register.name} = {value}: {fault}") from fault
 
-    def _occupy(self, begin: float, n_bytes: int) -> None:
-        self._line_free_at = max(begin, self._line_free_at) + n_bytes * self._byte_s
+    def _learn_from_late(self, servo: int) -> None:
+        due = self._owed.pop(servo, None)
+        if due is not None:
+            late = asyncio.get_running_loop().time() - due
+            if late < _LATEST_S:
+                self.latency.learn(late)
+
+    def _end_of_line(self, begin: float, n_bytes: int) -> float:
+        """When `n_bytes` that are sent at `begin` at the earliest have passed the wire."""
+        return max(begin, self._line_free_at) + n_bytes * self._byte_s
 
     def _finish(self) -> None:
         if self._waiting is not None and not self._waiting.done():

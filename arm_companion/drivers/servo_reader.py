@@ -1,6 +1,7 @@
 """Hearing every servo once a cycle: the Sync Read, its repairs, and what a cycle alone does not show."""
 
 import asyncio
+from collections import deque
 from collections.abc import Iterable, Sequence
 
 from arm_companion.config.schema import ServosConfig
@@ -13,7 +14,7 @@ from arm_companion.protocol.dynamixel import Packet
 
 _RETRIES = 3
 _PROBE_S = 0.05  # between attempts to hear each silent servo
-_AUDIT_EVERY = 8  # cycles
+_AUDIT_S = 0.08
 _SHORTEST_BOOT_S = 0.05  # no servo is back sooner after losing its power
 _STATUS = (ct.TORQUE_ENABLE.address, ct.HARDWARE_ERROR_STATUS.address + 1 - ct.TORQUE_ENABLE.address)
 _WATCHDOG = (ct.BUS_WATCHDOG.address, ct.BUS_WATCHDOG.size)
@@ -35,56 +36,67 @@ class ServoReader:
         self._timeout_s = config.reply_timeout_s
         self._silent_after = config.silent_after
         self._settings = settings
-        self._cycle = 0
+        self._doubtful: set[int] = set()  # heard again after a gap that is not explained yet
+        self._explained_at: dict[int, float] = {}
+        self._probes = 0
         self._next_probe_at = 0.0
         self._requests: dict[tuple[int, ...], bytes] = {}
-        self._audits = (self.check_torque, self.check_watchdog, self.check_goals)
+        self._next_audit_at = 0.0
+        self._audits = deque((self.check_torque, self.check_watchdog, self.check_goals))
 
     async def read(self) -> None:
         """Hear every servo, within the configuration's deadline."""
         now = asyncio.get_running_loop().time()
         deadline = now + self._timeout_s
-        self._cycle += 1
-        if self._cycle % _AUDIT_EVERY == 0:
-            audit = self._audits[self._cycle // _AUDIT_EVERY % len(self._audits)]
-            await audit([r for r in self._records if not r.missed], deadline)
         answers: dict[int, Packet] = {}
         if self._link.connected:
+            answers = await self._look_aside(now, deadline)
             present = [r for r in self._records if r.missed < self._silent_after]
             # A servo answers a Sync Read once the one before it has: doubtful ones come last.
             present.sort(key=lambda r: r.missed > 0)
-            answers = await self._ask_all(present, *_FEEDBACK, deadline)
-            if len(answers) < len(present):
-                await self._repair(answers, present, deadline)
-            if len(answers) < len(self._records):
-                answers |= await self._probe(now, deadline)
+            answers |= await self._ask_all(present, *_FEEDBACK, deadline)
+            await self._repair(answers, present, deadline)
         for record in self._records:
             packet = answers.get(record.id)
             if packet is None or not await self._accept(record, packet, deadline):
                 record.missed += 1
                 record.counters.missed_cycles += 1
 
+    async def _look_aside(self, now: float, deadline: float) -> dict[int, Packet]:
+        """Do at most one of the things that a cycle alone does not show, before the cycle's own read.
+
+        Returns:
+            The answer of a silent servo, if one was asked and answered.
+        """
+        silent = [r for r in self._records if r.missed >= self._silent_after]
+        doubtful = [r for r in self._records if r.id in self._doubtful]
+        if doubtful:
+            self._doubtful.discard(doubtful[0].id)
+            await self._explain_gap(doubtful[0], deadline)
+        elif silent and now >= self._next_probe_at:
+            self._next_probe_at = now + _PROBE_S / len(silent)
+            self._probes += 1
+            return await self._ask_one(silent[self._probes % len(silent)], *_FEEDBACK, deadline)
+        elif now >= self._next_audit_at:
+            self._next_audit_at = now + _AUDIT_S
+            self._audits.rotate()
+            await self._audits[0]([r for r in self._records if not r.missed], deadline)
+        return {}
+
     async def _repair(self, answers: dict[int, Packet], present: Iterable[ServoRecord], deadline: float) -> None:
         """Ask those one by one whose answers did not come."""
         for _ in range(_RETRIES):
-            for record in present:
-                if record.id not in answers:
-                    record.counters.lost += 1
-                    answers |= await self._ask_one(record, *_FEEDBACK, deadline)
-
-    async def _probe(self, now: float, deadline: float) -> dict[int, Packet]:
-        """Ask one of the silent servos now and then."""
-        silent = [r for r in self._records if r.missed >= self._silent_after]
-        if not silent or now < self._next_probe_at:
-            return {}
-        self._next_probe_at = now + _PROBE_S / len(silent)
-        return await self._ask_one(silent[self._cycle % len(silent)], *_FEEDBACK, deadline)
+            for record in [r for r in present if r.id not in answers]:
+                record.counters.lost += 1
+                answers |= await self._ask_one(record, *_FEEDBACK, deadline)
 
     async def _accept(self, record: ServoRecord, packet: Packet, deadline: float) -> bool:
         """Take what a servo measured; False if a gap before it could not be explained."""
         now = asyncio.get_running_loop().time()
-        gap = record.missed > 0 and record.set_up and now - record.answered_at > _SHORTEST_BOOT_S
+        known_at = max(record.answered_at, self._explained_at.get(record.id, 0.0))
+        gap = record.missed and record.set_up and now - known_at > _SHORTEST_BOOT_S
         if gap and not await self._explain_gap(record, deadline):
+            self._doubtful.add(record.id)
             return False
         record.take(ct.decode_feedback(packet.parameters), now)
         if packet.error & dxl.ALERT:
@@ -101,6 +113,8 @@ class ServoReader:
         answers = await self._ask_one(record, *_RAM, deadline)
         if record.id not in answers:
             return False
+        self._explained_at[record.id] = asyncio.get_running_loop().time()
+        record.missed = 1  # it belongs to the next Sync Read again
         ram = answers[record.id].parameters
         at = ct.PROFILE_VELOCITY.address - _RAM[0]
         if ct.PROFILE_VELOCITY.decode(ram[at : at + ct.PROFILE_VELOCITY.size]) != self._settings.profile_velocity:

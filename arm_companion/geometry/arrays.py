@@ -1,5 +1,6 @@
 """The array type of the mechanics, and arrays that a frozen dataclass may hold."""
 
+import math
 from collections.abc import Sequence
 from typing import TypeAlias
 
@@ -25,10 +26,11 @@ def frozen(values: ArrayLike, shape: tuple[int, ...], name: str = "array") -> Ar
         ValueError: for another shape, or an entry that is not finite.
     """
     array = np.array(values, dtype=np.float64)
-    fits = len(shape) == array.ndim and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
-    if not fits:
-        raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
-    if not np.isfinite(array).all():
+    if array.shape != shape:
+        fits = len(shape) == array.ndim and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+        if not fits:
+            raise ValueError(f"{name} has shape {array.shape}, expected {shape}")
+    if not all(map(math.isfinite, array.ravel().tolist())):
         raise ValueError(f"{name} has entries that are not finite: {array.tolist()}")
     array.flags.writeable = False
     return array

@@ -138,9 +138,7 @@ def to_quaternion(R: Array) -> tuple[float, float, float, float]:
     largest = max(range(4), key=squares.__getitem__)
     a, b, c = float(R[2, 1] - R[1, 2]), float(R[0, 2] - R[2, 0]), float(R[1, 0] - R[0, 1])
     d, e, f = float(R[1, 0] + R[0, 1]), float(R[0, 2] + R[2, 0]), float(R[2, 1] + R[1, 2])
-    row = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))[
-        largest
-    ]
+    row = ((squares[0], a, b, c), (a, squares[1], d, e), (b, d, squares[2], f), (c, e, f, squares[3]))[largest]
     scale = math.copysign(0.5 / math.sqrt(squares[largest]), row[0])
     return row[0] * scale, row[1] * scale, row[2] * scale, row[3] * scale
 

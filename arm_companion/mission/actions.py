@@ -1,9 +1,11 @@
 """What each phase does while it lasts: arm bend, vehicle reference and set-point."""
 
 import dataclasses
+import math
 
 import numpy as np
 
+from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.motion import (
     ZERO,
@@ -22,7 +24,15 @@ from arm_companion.mission.state import Phase, State
 from arm_companion.mission.wrench import grip
 
 _PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING})
-_REFERENCE_RESTS = frozenset({Phase.READYING, Phase.READY, Phase.STOWING, Phase.STOWED, Phase.HOLDING, Phase.RELEASE})
+_REFERENCE_RESTS = frozenset(
+    {
+        Phase.READYING,
+        Phase.READY,
+        Phase.STOWING,
+        Phase.STOWED,
+        Phase.HOLDING,
+    }
+)
 _ORDER_OF_PERCH = (
     Phase.APPROACH,
     Phase.REACH,
@@ -32,7 +42,6 @@ _ORDER_OF_PERCH = (
     Phase.PERCHED,
 )
 _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
-_FOLLOW_S = 1.0
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
@@ -60,7 +69,7 @@ def prepare(s: Situation) -> State:
         case Phase.REACH:
             return dataclasses.replace(state, force=dataclasses.replace(state.force, tared_s=0.0, above_s=0.0))
         case Phase.CONTACT:
-            return dataclasses.replace(state, reference=_here(s, state.heading))
+            return dataclasses.replace(state, contact_w=_touching(s))
         case Phase.WRAP:
             x, y = s.towards_bar_a
             theta = s.config.perch.wrap_bend_rad
@@ -72,6 +81,8 @@ def prepare(s: Situation) -> State:
                 offset=ZERO,
                 bend_goal=state.bend,
             )
+        case Phase.PERCHED if state.anchor is not None:
+            return dataclasses.replace(state, reference=Reference(state.anchor.position_w, ZERO, state.heading))
         case Phase.UNLOAD:
             return dataclasses.replace(state, offset=ZERO, bend_goal=state.bend)
     return state
@@ -88,8 +99,15 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
         return state, ArmAction.HOLD, None
     speed = s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
-    pulls = s.parameters.model.pull_for_bend(np.asarray(bend))
+    pulls = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))
     return dataclasses.replace(state, bend=bend), ArmAction.DRIVE, tuple(float(p) for p in pulls)
+
+
+def _pretension(s: Situation, theta: float) -> float:
+    """Co-contraction, N: enough that the outer tendon of a bend `theta` keeps the least tension."""
+    arm = s.parameters.model.parameters
+    swing = theta * arm.EI / (2.0 * arm.r * arm.L)  # tau_i = T0 + swing cos(phi_i - delta), model.md
+    return max(s.config.arm.tendons.pretension_n, swing + s.config.limits.tension_min_n)
 
 
 def setpoint(s: Situation) -> Setpoint | None:
@@ -131,11 +149,8 @@ def _reference(s: Situation) -> Reference | None:
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:
         return dataclasses.replace(reference, velocity=ZERO)
-    if state.phase in (Phase.CONTACT, Phase.WRAP):
-        # the arm is stiffer than the autopilot's position loop: asking for another place only winds it up
-        share = min(s.dt / _FOLLOW_S, 1.0)
-        way = scale(sub(s.facts.vehicle.position_w, reference.position), share)
-        return Reference(add(reference.position, way), ZERO, state.heading)
+    if state.phase in (Phase.WRAP, Phase.RELEASE):
+        return Reference(_beside_bar(s), ZERO, state.heading)
     goal, speed = _goal(s)
     return follow(
         reference,
@@ -148,6 +163,40 @@ def _reference(s: Situation) -> Reference | None:
     )
 
 
+def _touching(s: Situation) -> Vec3:
+    """Vehicle position, height aside, at which the straight arm just touches the bar that was found, world axes.
+
+    The vehicle is past it by what bends the arm, a cantilever up to the bar, and by what it flew while the
+    force observer followed.
+    """
+    arm, perch = s.parameters.model.parameters, s.config.perch
+    cantilever = 3.0 * arm.EI / perch.contact_arc_m**3
+    force = strength(s.state.force.residual)
+    past = min(force / cantilever + OBSERVER_LAG_S * perch.reach_speed_m_per_s, perch.overreach_m)
+    x, y, _ = add(s.facts.vehicle.position_w, scale(s.ahead, -past))
+    return x, y, s.place(0.0)[2]
+
+
+def _beside_bar(s: Situation) -> Vec3:
+    """Vehicle position that suits the present bend, between the bar just cleared and the full wrap, world axes.
+
+    Tendons bend the whole arm alike, so an arm that wraps a bar curls from its base on: while it bends, the
+    vehicle comes down along the arm by the length that the bar was away, and forward by the clearance. On this
+    way the arm meets the bar only when the wrap closes, which keeps the vehicle from bouncing off it.
+    """
+    state, perch = s.state, s.config.perch
+    share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
+    closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
+    if state.phase is Phase.RELEASE and state.anchor is not None:
+        closed = state.anchor.position_w
+    clear = _clear_of_bar(s)
+    return add(clear, scale(sub(closed, clear), share))
+
+
+def _clear_of_bar(s: Situation) -> Vec3:
+    return add(s.state.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
+
+
 def _goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes in a phase that moves the vehicle, and how fast."""
     perch = s.config.perch
@@ -157,6 +206,8 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
             return s.place(perch.standoff_m), perch.approach_speed_m_per_s
         case Phase.DEPART:
             return s.place(perch.standoff_m), min(perch.approach_speed_m_per_s, s.config.limits.vehicle_speed_m_per_s)
+        case Phase.CONTACT:
+            return _clear_of_bar(s), perch.reach_speed_m_per_s
         case Phase.REACH:
             return s.place(-perch.overreach_m), perch.reach_speed_m_per_s
         case Phase.VERIFY:

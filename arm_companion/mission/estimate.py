@@ -9,14 +9,17 @@ what is left over is a force from outside.
 import math
 from dataclasses import dataclass, replace
 
-from arm_companion.mission.facts import TendonState, VehicleState
-from arm_companion.mission.motion import rotate
+from arm_companion.mission.facts import TendonState, Vec3, VehicleState
+from arm_companion.mission.motion import add, norm, rotate, scale, sub
 
 GRAVITY = 9.80665
-_POLE = 6.0  # rad/s, both poles of the observer
+_POLE = 9.0  # rad/s, both poles of the observer
+OBSERVER_LAG_S = 2.0 / _POLE
 _TARE_S = 1.0
 _TENSION_SMOOTHING_S = 0.15
 _MOVING_M_PER_S = 0.002
+_POSITION_SMOOTHING_S = 0.25
+_JUMP_M = 0.2
 
 Vec2 = tuple[float, float]
 
@@ -93,6 +96,14 @@ def smooth_tensions(old: tuple[float, ...], tendons: tuple[TendonState, ...], dt
         before + share * (tendon.tension - before) if abs(tendon.speed) > _MOVING_M_PER_S else before
         for before, tendon in zip(old, tendons, strict=True)
     )
+
+
+def smooth_position(old: Vec3, vehicle: VehicleState, dt: float) -> Vec3:
+    """Vehicle position, m, smoothed over a quarter of a second; a jump is taken at once."""
+    new = vehicle.position_w
+    if norm(sub(new, old)) > _JUMP_M:
+        return new
+    return add(old, scale(sub(new, old), dt / (_POSITION_SMOOTHING_S + dt)))
 
 
 def strength(force: Vec2) -> float:

@@ -5,7 +5,7 @@ import math
 
 from arm_companion.errors import CommandRejected
 from arm_companion.mission import actions
-from arm_companion.mission.estimate import observe_force, smooth_tensions, tare, time_above
+from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
 from arm_companion.mission.facts import (
     Answer,
     ArmAction,
@@ -86,7 +86,12 @@ def _estimate(s: Situation) -> State:
     if state.phase is Phase.REACH:
         # the bar pushes the arm, and with it the vehicle, back
         force = time_above(tare(force, s.dt), (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
-    return dataclasses.replace(state, force=force, tension=smooth_tensions(state.tension, s.facts.tendons, s.dt))
+    return dataclasses.replace(
+        state,
+        force=force,
+        tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
+        position=smooth_position(state.position, s.facts.vehicle, s.dt),
+    )
 
 
 def _yield_to_pilot(s: Situation, notices: list[Notice]) -> Situation:
@@ -111,7 +116,6 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         again_later = TABLE.known(request.order)
         result = Result.TEMPORARILY_REJECTED if again_later else Result.DENIED
         answers.append(Answer(request.id, result, rejected.reason))
-        notices.append(Notice(Severity.WARNING, f"{name} rejected: {rejected.reason}"))
         return s
     s = s.remembering(jogged)
     if s.state.running is not None and request.order is not Order.JOG:

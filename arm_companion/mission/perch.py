@@ -6,7 +6,7 @@ Abort rows stand first and therefore win. A row's guard returns its reason in wo
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Control, Order
 from arm_companion.mission.machine import OrderRow, Table, Transition
-from arm_companion.mission.motion import arrived, dot, norm, scale, sub
+from arm_companion.mission.motion import ZERO, arrived, dot, norm, scale, sub
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import Phase
 
@@ -23,6 +23,8 @@ TENSE = GRASPING | GRIPPED | frozenset({Phase.UNLOAD, Phase.HOLDING})
 _AT_STANDOFF_M = 0.06
 _CONTACT_PERSISTS_S = 0.15
 _SETTLE_S = 1.0
+_CONTACT_SETTLE_S = 2.5
+_AT_BAR_M = 0.03
 _PROBE_S = 3.0
 _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
@@ -169,8 +171,11 @@ def contact_found(s: Situation) -> str | None:
 
 
 def contact_settled(s: Situation) -> str | None:
-    """The vehicle has stopped at the bar."""
-    return "settled at the bar" if s.elapsed > _SETTLE_S else None
+    """The vehicle rests just clear of the bar that it touched."""
+    reference = s.state.reference
+    if reference is None or s.elapsed < _CONTACT_SETTLE_S or reference.velocity != ZERO:
+        return None
+    return "settled clear of the bar" if at(s, reference.position, _AT_BAR_M) else None
 
 
 def wrapped(s: Situation) -> bool:
@@ -200,8 +205,10 @@ def pull_test_passed(s: Situation) -> str | None:
 
 
 def unloaded(s: Situation) -> str | None:
-    """The reference is back at the anchor, so that letting go does not kick."""
-    return "unloaded" if s.elapsed > _SETTLE_S and norm(s.state.offset) == 0.0 else None
+    """The reference is back at the anchor and nothing is fed forward, so that letting go does not kick."""
+    reference, anchor = s.state.reference, s.state.anchor
+    back = reference is None or anchor is None or arrived(reference, anchor.position_w)
+    return "unloaded" if s.elapsed > _SETTLE_S and back and s.state.lean == ZERO else None
 
 
 def unwrapped(s: Situation) -> str | None:

@@ -159,13 +159,15 @@ class Situation:
         """
         bar = self.bar
         perch = self.config.perch
-        yaw = self.state.heading
         back = before_contact + bar.radius + perch.disk_radius_m
         base = sub(bar.point_w, scale(self.ahead, back))
-        # the straight arm points along +z of its base: down when it is mounted below
-        straight = turn_by_yaw(_column(self.mount.rotation, 2), yaw)
-        base = sub(base, scale(straight, perch.contact_arc_m))
-        return sub(base, self.base_offset_w(yaw))
+        base = sub(base, scale(self.straight_w, perch.contact_arc_m))
+        return sub(base, self.base_offset_w(self.state.heading))
+
+    @property
+    def straight_w(self) -> Vec3:
+        """Where the straight arm of the hovering vehicle points, world axes: +z of its base, down when below."""
+        return turn_by_yaw(_column(self.mount.rotation, 2), self.state.heading)
 
     @property
     def ahead(self) -> Vec3:

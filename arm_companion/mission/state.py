@@ -1,11 +1,13 @@
 """What the mission remembers from one cycle to the next."""
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, Vec3, WrenchReport
 from arm_companion.mission.motion import ZERO, Reference
+from arm_companion.record_codec import UNRECORDED
 
 
 class Phase(enum.Enum):
@@ -66,6 +68,8 @@ class Prediction:
     wrench: WrenchReport
     tip_a: Vec3  # m, base axes
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
+    # where the next solve starts; it follows from what was recorded before, so it is not recorded itself
+    start: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +85,11 @@ class State:
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
     reference: Reference | None = None
+    contact_w: Vec3 = ZERO  # m, vehicle reference when contact was found
     heading: float = 0.0  # rad, at which the vehicle faces the bar
     force: ForceObserver = ForceObserver()
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
+    position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None
     prediction: Prediction | None = None
     lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now

@@ -1,12 +1,14 @@
 """The reaction wrench of the arm on the airframe, predicted from what the phase says about its surroundings."""
 
 import math
+from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
 from arm_companion.arm import arc
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind
-from arm_companion.arm.reaction import BodyMotion, Reaction, reaction
+from arm_companion.arm.reaction import BodyMotion, Reaction, Spread, reaction
 from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
@@ -19,6 +21,8 @@ from arm_companion.mission.state import Anchor, Phase, Prediction
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
 _LEAST_HZ = 5.0
+# the vehicle's position since the grip is known to a few millimetres, and where the wrap ends is not sharp
+_SPREAD = Spread(hold_position=0.003, hold_rotation=0.03)
 _NAN3: Vec3 = (math.nan, math.nan, math.nan)
 
 
@@ -31,7 +35,14 @@ def predict(s: Situation) -> Prediction:
     period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
     if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
         return last
-    return Prediction(s.t, _wrench(s), _tip(s), _lean(s))
+    holding = s.state.phase in _ANCHORED and s.state.anchor is not None
+    start = last.start if last is not None and holding else None
+    solution = None
+    with suppress(ModelError):
+        solution = anchored(s, s.state.position, start) if holding else s.free_arm
+    return Prediction(
+        s.t, _wrench(s, solution, holding=holding), _tip(s), _lean(s, solution), solution if holding else None
+    )
 
 
 def grip(s: Situation) -> Anchor:
@@ -40,24 +51,26 @@ def grip(s: Situation) -> Anchor:
     The hovering vehicle carries no load then, so the part between base and bar has the bend that its tendons
     alone give it: an arc with the moment `sum r tau (cos phi, sin phi)` all along.
     """
-    vehicle, tension = s.facts.vehicle, s.state.tension
+    attitude, tension = s.facts.vehicle.attitude_wb, s.state.tension
     model = s.parameters.model
-    length = s.config.perch.contact_arc_m
-    arm = model.parameters
+    arm, length = model.parameters, s.config.perch.free_arc_m
     u = arm.H.T @ np.asarray(tension) * (length / arm.EI)
     R_as, p_as = arc.tip_rotation(u), arc.tip_position(u, length)
+    free = Anchor(s.state.position, attitude, tension, _vec3(p_as), so3.to_quaternion(R_as))
     try:
-        hold = model.anchor(
-            Hold(length, Pose(R_as, p_as)), np.asarray(s.pulls), np.asarray(tension), np.asarray(s.gravity_a)
-        )
-        beyond = () if hold.beyond is None else tuple(float(b) for b in hold.beyond)
+        held = model.anchor(_hold(s, free), np.asarray(s.pulls), np.asarray(tension), np.asarray(s.gravity_a))
     except ModelError:
-        beyond = ()
-    return Anchor(vehicle.position_w, vehicle.attitude_wb, tension, _vec3(p_as), so3.to_quaternion(R_as), beyond)
+        return free
+    return replace(free, beyond=() if held.beyond is None else tuple(float(b) for b in held.beyond))
 
 
-def anchored(s: Situation, position_w: Vec3) -> ArmSolution:
+def anchored(s: Situation, position_w: Vec3, start: ArmSolution | None) -> ArmSolution:
     """The arm between the bar and an airframe at `position_w` with the present attitude.
+
+    Args:
+        s: the cycle.
+        position_w: of the vehicle, m.
+        start: a neighbouring solution, which saves most of the time.
 
     Raises:
         ModelError: nothing is anchored, or no equilibrium was found.
@@ -67,29 +80,39 @@ def anchored(s: Situation, position_w: Vec3) -> ArmSolution:
         raise ModelError("nothing is anchored")
     then = Pose.of_quaternion(anchor.attitude_wb, np.asarray(anchor.position_w)) @ s.mount
     now = Pose.of_quaternion(s.facts.vehicle.attitude_wb, np.asarray(position_w)) @ s.mount
-    section = Pose.of_quaternion(anchor.section_attitude_as, np.asarray(anchor.section_position_a))
-    hold = Hold(s.config.perch.contact_arc_m, section, HoldKind.CLAMPED, beyond=np.asarray(anchor.beyond))
-    seen = hold.seen_from(now.inverse() @ then)
-    return s.parameters.model.held(np.asarray(s.pulls), seen, np.asarray(s.gravity_a))
+    hold = _hold(s, anchor).seen_from(now.inverse() @ then)
+    return s.parameters.model.held(np.asarray(s.pulls), hold, np.asarray(s.gravity_a), start=start)
 
 
-def _wrench(s: Situation) -> WrenchReport:
+def _hold(s: Situation, anchor: Anchor) -> Hold:
+    """The grip in base axes of the moment in which it was taken.
+
+    A closed wrap grips with its last part, so that the arm up to there is free; friction keeps it from rolling.
+    """
+    return Hold(
+        s.config.perch.free_arc_m,
+        Pose.of_quaternion(anchor.section_attitude_as, np.asarray(anchor.section_position_a)),
+        HoldKind.CLAMPED,
+        beyond=np.asarray(anchor.beyond) if anchor.beyond else None,
+    )
+
+
+def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> WrenchReport:
     """ARM_REACTION_WRENCH: a number only where the model stands for it."""
-    if s.state.phase in _ANCHORED and s.state.anchor is not None:
+    if holding:
         source = WrenchSource.ANCHORED
     else:
         source = WrenchSource.CONTACT if s.state.phase in _TOUCHING else WrenchSource.FREE
+    if solution is None or not s.vehicle_fresh:
+        return _nothing(source)
     vehicle = s.facts.vehicle
     try:
-        anchored_now = source is WrenchSource.ANCHORED
-        solution = anchored(s, vehicle.position_w) if anchored_now else s.free_arm
-        if solution is None or not s.vehicle_fresh:
-            return _nothing(source)
         found = reaction(
             solution,
             s.mount,
             np.asarray(s.gravity_a),
             BodyMotion(rate=np.asarray(vehicle.rate_b)),
+            spread=_SPREAD,
             age=max(vehicle.position_age_s, vehicle.attitude_age_s),
         )
     except ModelError:
@@ -98,7 +121,7 @@ def _wrench(s: Situation) -> WrenchReport:
     return _report(found, source, valid=source is not WrenchSource.CONTACT)
 
 
-def _lean(s: Situation) -> Vec3:
+def _lean(s: Situation, start: ArmSolution | None) -> Vec3:
     """Acceleration that holds the vehicle at its reference against the anchored arm, m/s^2, world axes.
 
     From the force at the *reference*: a force measured where the vehicle is would cancel the arm's own
@@ -110,7 +133,7 @@ def _lean(s: Situation) -> Vec3:
     if norm(sub(reference.position, anchor.position_w)) == 0.0:
         return ZERO
     try:
-        there, here = anchored(s, reference.position), anchored(s, anchor.position_w)
+        there, here = (anchored(s, at, start) for at in (reference.position, anchor.position_w))
     except ModelError:
         return ZERO
     force_b = s.mount.rotation @ (there.base_wrench[:3] - here.base_wrench[:3])

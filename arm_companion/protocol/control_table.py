@@ -157,9 +157,7 @@ GOAL_PWM = _write("goal PWM", 100, 2, -PWM_FULL, PWM_FULL, PWM_FULL)
 GOAL_VELOCITY = _write("goal velocity", 104, 4, -1023, 1023, 0)
 PROFILE_ACCELERATION = _write("profile acceleration", 108, 4, 0, 32_767, 0)
 PROFILE_VELOCITY = _write("profile velocity", 112, 4, 0, 32_767, 0)
-GOAL_POSITION = _write(
-    "goal position", 116, 4, -EXTENDED_POSITION_LIMIT_TICKS, EXTENDED_POSITION_LIMIT_TICKS, 0
-)
+GOAL_POSITION = _write("goal position", 116, 4, -EXTENDED_POSITION_LIMIT_TICKS, EXTENDED_POSITION_LIMIT_TICKS, 0)
 REALTIME_TICK = _read("realtime tick", 120, 2)
 MOVING = _read("moving", 122, 1)
 MOVING_STATUS = _read("moving status", 123, 1)

@@ -15,6 +15,7 @@ the missing l phi^2/12 at run time (`chord_excess`), as length and as the force 
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arm_companion.config.schema import ArmConfig, Config, MountConfig
@@ -107,17 +108,21 @@ def model_xml(config: Config) -> str:
     return f"""
 <mujoco model="arm companion plant">
   <compiler angle="degree" autolimits="true" eulerseq="XYZ"/>
-  <option timestep="{config.sim.step_s}" gravity="0 0 {-GRAVITY}" integrator="implicitfast" cone="elliptic" impratio="10"
-          solver="Newton" iterations="20" tolerance="1e-9"><flag autoreset="disable" multiccd="disable"/></option>
+  <option timestep="{config.sim.step_s}" gravity="0 0 {-GRAVITY}" integrator="implicitfast"
+          cone="elliptic" impratio="10" solver="Newton" iterations="20" tolerance="1e-9">
+    <flag autoreset="disable" multiccd="disable"/>
+  </option>
   <default>
     <geom contype="0" conaffinity="0"/>
-    <default class="bar"><geom contype="{_BAR}" conaffinity="{_ARM | _AIRFRAME}" priority="1" solref="0.004 1"/></default>
+    <default class="bar">
+      <geom contype="{_BAR}" conaffinity="{_ARM | _AIRFRAME}" priority="1" solref="0.004 1" mass="0"/>
+    </default>
   </default>
   <worldbody>
     <geom name="ground" type="plane" size="0 0 1" pos="0 0 {-stand}" contype="{_GROUND}"
           conaffinity="{_FEET | _AIRFRAME | _ARM}" rgba=".75 .75 .72 1"/>
     <body name="{BAR}" mocap="true" pos="{x} {y} {z}" euler="0 0 {heading}">
-      <geom name="{BAR}" class="bar" type="capsule" mass="0" size="{bar.radius_m}" rgba=".45 .3 .15 1"
+      <geom name="{BAR}" class="bar" type="capsule" size="{bar.radius_m}" rgba=".45 .3 .15 1"
             fromto="{-_BAR_HALF_LENGTH} 0 0 {_BAR_HALF_LENGTH} 0 0" friction="{bar.friction} 0.005 0.0001"/>
     </body>
     <body name="{AIRFRAME}" quat="0 1 0 0">
@@ -144,12 +149,17 @@ def link(i: int) -> str:
     return f"link {i}"
 
 
+def disk(i: int) -> str:
+    """Name of the geom of disk i; 0 is the base disk."""
+    return f"disk {i}"
+
+
 def tendon(i: int) -> str:
     """Name of tendon i, counted from 0 in the configuration's order."""
     return f"tendon {i}"
 
 
-def up(vector: tuple[float, ...]) -> tuple[float, float, float]:
+def up(vector: Sequence[float]) -> tuple[float, float, float]:
     """World vector from NED to MuJoCo's z-up axes, or back."""
     return (vector[0] * NED_TO_UP[0], vector[1] * NED_TO_UP[1], vector[2] * NED_TO_UP[2])
 
@@ -166,9 +176,7 @@ def _airframe(config: Config, stand: float) -> str:
         f'<geom type="cylinder" size="{config.arm.pitch_radius_m}" fromto="{neck}" {solid}/>',
     ]
     for sx, sy in ((1, 1), (1, -1), (-1, -1), (-1, 1)):
-        lines.append(
-            f'<geom type="cylinder" size="{_ROTOR_RADIUS} 0.005" pos="{sx * x} {sy * y} {z}" {solid}/>'
-        )
+        lines.append(f'<geom type="cylinder" size="{_ROTOR_RADIUS} 0.005" pos="{sx * x} {sy * y} {z}" {solid}/>')
         # The skids fold up in flight, as on camera drones: they meet the ground and nothing else.
         fx, fy = sx * _FOOT_OFFSET[0], sy * _FOOT_OFFSET[1]
         lines.append(
@@ -180,20 +188,20 @@ def _airframe(config: Config, stand: float) -> str:
 def _arm(config: Config) -> str:
     arm, section = config.arm, rod(config.arm)
     interval = arm.length_m / arm.disks
-    lines = [_backbone(section, 0.0, interval / 2, _ARM), _disk(config, 0.0, 0.0), *_holes(arm, "base", 0.0)]
+    lines = [_backbone(section, 0.0, interval / 2, _ARM), _disk(config, 0, 0.0, 0.0), *_holes(arm, "base", 0.0)]
     origin = interval / 2  # of a link in its parent: the middle of the interval between them
     for i in range(1, arm.disks + 1):
         last = i == arm.disks
         affinity = 0 if i <= _SHIELDED_LINKS else _AIRFRAME
         after = 0.0 if last else interval / 2
         mass = arm.mass.end_disk_kg if last else arm.mass.disk_kg
-        disk = interval / 2  # height of the disk in its link
+        middle = interval / 2  # height of the disk in its link
         lines += [
             f'<body name="{link(i)}" pos="0 0 {origin}">',
             *_hinges(section, interval, i),
-            _backbone(section, 0.0, disk + after, _ARM, affinity),
-            _disk(config, disk, mass, affinity),
-            *_holes(arm, str(i), disk),
+            _backbone(section, 0.0, middle + after, _ARM, affinity),
+            _disk(config, i, middle, mass, affinity),
+            *_holes(arm, str(i), middle),
         ]
         origin = interval
     lines.append(f'<site name="{TIP}" pos="0 0 {interval / 2}"/>')
@@ -208,7 +216,8 @@ def _hinges(section: Rod, interval: float, i: int) -> list[str]:
         role = TORSION if name == "z" else BENDING
         k = (section.torsion if name == "z" else section.bending) / interval
         lines.append(
-            f'<joint name="{role} {name} {i}" axis="{axes[name]}" stiffness="{k}" damping="{k * _BACKBONE_DAMPING_S}" armature="{_ARMATURE}"/>'
+            f'<joint name="{role} {name} {i}" axis="{axes[name]}" stiffness="{k}" '
+            f'damping="{k * _BACKBONE_DAMPING_S}" armature="{_ARMATURE}"/>'
         )
     return lines
 
@@ -220,9 +229,10 @@ def _backbone(section: Rod, start: float, end: float, contype: int, affinity: in
     )
 
 
-def _disk(config: Config, height: float, mass: float, affinity: int = 0) -> str:
+def _disk(config: Config, i: int, height: float, mass: float, affinity: int = 0) -> str:
+    size = f"{config.perch.disk_radius_m} {_DISK_HALF_THICKNESS}"
     return (
-        f'<geom type="cylinder" size="{config.perch.disk_radius_m} {_DISK_HALF_THICKNESS}" pos="0 0 {height}" '
+        f'<geom name="{disk(i)}" type="cylinder" size="{size}" pos="0 0 {height}" '
         f'mass="{mass}" contype="{_ARM}" conaffinity="{affinity}" rgba=".8 .45 .1 1"/>'
     )
 

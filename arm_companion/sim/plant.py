@@ -32,7 +32,6 @@ class Plant:
     """
 
     def __init__(self, config: Config) -> None:
-        self._arm = config.arm
         self._stiffness = mjcf.tendon_stiffness(config.arm)
         self._wind = mjcf.up(config.sim.wind_m_per_s)
         self._push: Vec3 = (0.0, 0.0, 0.0)
@@ -44,6 +43,7 @@ class Plant:
         self._base = model.body(mjcf.ARM_BASE).id
         self._bar = model.body(mjcf.BAR).id
         self._tip = model.site(mjcf.TIP).id
+        self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
         # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
         self._link_of_geom = np.full(model.ngeom, -1)
         for i in range(config.arm.disks + 1):
@@ -54,6 +54,11 @@ class Plant:
         self._bending_qpos = model.jnt_qposadr[self._bending]
         self._bending_stiffness = float(model.jnt_stiffness[hinges[0]])
         self._excess = mjcf.chord_excess(config.arm)
+        self._straight_rest = config.arm.length_m - config.arm.tendons.pretension_n / self._stiffness
+        # views of MuJoCo's own memory, made once because a step asks for them all
+        self._qpos, self._qvel, self._applied = self._data.qpos, self._data.qvel, self._data.qfrc_applied[:6]
+        self._lengths, self._rest = self._data.ten_length, model.tendon_lengthspring[:, 1]
+        self._hinge_stiffness = model.jnt_stiffness
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
         mujoco.mj_forward(model, self._data)
@@ -73,17 +78,17 @@ class Plant:
             pulls: m of each tendon taken in from where the straight arm has its pretension.
 
         Raises:
-            ModelError: when the motion has diverged.
+            ModelError: when the motion has diverged or a command is no finite number.
             ValueError: when there is not one pull for each tendon.
         """
-        data = self._data
-        self._set_pulls(pulls)
-        w, x, y, z = data.qpos[3:7].tolist()
-        vx, vy, vz, p, q, r = data.qvel[:6].tolist()
-        if not math.isfinite(vx + vy + vz + p + q + r):
-            raise ModelError(f"the plant diverged at {self.time:.3f} s")
+        w, x, y, z = self._qpos[3:7].tolist()
+        vx, vy, vz, p, q, r = self._qvel[:6].tolist()
+        if len(pulls) != len(self._rest):
+            raise ValueError(f"{len(pulls)} pulls for {len(self._rest)} tendons")
+        if not math.isfinite(sum((vx, vy, vz, p, q, r, rotors.thrust_n, *rotors.torque_b, *pulls))):
+            raise ModelError(f"the plant diverged at {self.time:.3f} s, or was commanded what is no number")
         thrust = -rotors.thrust_n
-        data.qfrc_applied[:6] = (
+        self._applied[:] = (
             thrust * 2 * (x * z + w * y) - _DRAG_N_PER_M_S * (vx - self._wind[0]) + self._push[0],
             thrust * 2 * (y * z - w * x) - _DRAG_N_PER_M_S * (vy - self._wind[1]) + self._push[1],
             thrust * (1 - 2 * (x * x + y * y)) - _DRAG_N_PER_M_S * (vz - self._wind[2]) + self._push[2],
@@ -91,9 +96,10 @@ class Plant:
             rotors.torque_b[1] - _ROTARY_DRAG_NM_PER_RAD_S * q,
             rotors.torque_b[2] - _ROTARY_DRAG_NM_PER_RAD_S * r,
         )
-        self._velocity_before[:] = data.qvel
+        self._set_pulls(pulls)
+        self._velocity_before[:] = self._qvel
         self._truth = None
-        mujoco.mj_step(self._model, data)
+        mujoco.mj_step(self._model, self._data)
 
     def state(self) -> RigidState:
         """True motion of the airframe now; the specific force is the last step's mean."""
@@ -113,8 +119,7 @@ class Plant:
 
     def tensions(self) -> tuple[float, ...]:
         """Tension in N of each tendon, as it acted during the last step."""
-        stretch = self._data.ten_length - self._model.tendon_lengthspring[:, 1]
-        return tuple(np.maximum(0.0, self._stiffness * stretch).tolist())
+        return tuple((self._stiffness * np.maximum(0.0, self._lengths - self._rest)).tolist())
 
     def truth(self) -> PlantTruth:
         """What only a simulation can know: wrench and contacts are those of the last step."""
@@ -128,7 +133,7 @@ class Plant:
         Args:
             position_w: a point on its axis, m, NED.
         """
-        self._data.mocap_pos[0] = mjcf.up(tuple(position_w))
+        self._data.mocap_pos[0] = mjcf.up(position_w)
 
     def push(self, force_w: Sequence[float]) -> None:
         """Push the airframe at its centre of mass until told otherwise.
@@ -136,7 +141,7 @@ class Plant:
         Args:
             force_w: N, NED; zeros end the push.
         """
-        self._push = mjcf.up(tuple(force_w))
+        self._push = mjcf.up(force_w)
 
     def _set_pulls(self, pulls: Sequence[float]) -> None:
         """Set the tendon springs' rest lengths, beyond which a tendon pulls; a slack tendon does not damp either.
@@ -144,14 +149,13 @@ class Plant:
         The arcs between the disks are longer than the hinged chain by `chord_excess` for every squared radian of
         a hinge: that goes into the rest length, and its derivative, tension times angle, is a spring in the hinge.
         """
-        model, data, arm = self._model, self._data, self._arm
-        total = sum(self.tensions())
-        bend = data.qpos[self._bending_qpos]
-        model.jnt_stiffness[self._bending] = self._bending_stiffness + 2 * self._excess * total
-        rest = arm.length_m - arm.tendons.pretension_n / self._stiffness - self._excess * float(bend @ bend)
-        for i, (pull, length) in enumerate(zip(pulls, data.ten_length.tolist(), strict=True)):
-            model.tendon_lengthspring[i, 1] = rest - pull
-            model.tendon_damping[i] = self._damping if length > rest - pull else 0.0
+        lengths, rest = self._lengths, self._rest
+        total = self._stiffness * float(np.maximum(0.0, lengths - rest).sum())
+        bend = self._qpos[self._bending_qpos]
+        self._hinge_stiffness[self._bending] = self._bending_stiffness + 2 * self._excess * total
+        rest[:] = self._straight_rest - self._excess * float(bend @ bend)
+        rest -= pulls
+        self._model.tendon_damping[:] = self._damping * (lengths > rest)
 
     def _measure(self) -> PlantTruth:
         model, data = self._model, self._data
@@ -175,15 +179,16 @@ class Plant:
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:
         """Force and torque of the arm on the airframe about its centre of mass, body axes.
 
-        Newton-Euler from the tip to the base with the accelerations that the step really made: under implicit
-        integration they differ from the forward dynamics' own.
+        Newton-Euler from the tip to the base, at the step's start but with the accelerations that the step
+        really made: under implicit integration they differ from the forward dynamics' own.
         """
         model, data = self._model, self._data
-        data.qacc[:] = (data.qvel - self._velocity_before) / self._dt
+        velocity = data.qvel.copy()
+        data.qacc[:] = (velocity - self._velocity_before) / self._dt
+        data.qvel[:] = self._velocity_before
         mujoco.mj_rnePostConstraint(model, data)
-        wrench = data.cfrc_int[
-            self._base
-        ]  # torque, force of the airframe on the arm, about the tree's centre
+        data.qvel[:] = velocity
+        wrench = data.cfrc_int[self._base]  # torque, force of the airframe on the arm, about the tree's centre
         centre = data.subtree_com[self._airframe] - data.xpos[self._airframe]
         rotation = data.xmat[self._airframe].reshape(3, 3)
         force = -wrench[3:]
@@ -194,34 +199,35 @@ class Plant:
         """Sum of normal forces, net force on the arm (NED) and wrap angle of the arm's contacts with the bar."""
         model, data = self._model, self._data
         total, net = 0.0, np.zeros(3)
-        touches: list[tuple[int, Array]] = []
+        touching: set[int] = set()
         result = np.zeros(6)
         for i in range(data.ncon):
             contact = data.contact[i]
             one, other = contact.geom
-            if model.geom_bodyid[other] == self._bar:
+            bar_first = model.geom_bodyid[one] == self._bar
+            if not bar_first:
                 one, other = other, one
-                sign = 1.0  # the contact frame points from the bar to the arm
-            else:
-                sign = -1.0
-            number = self._link_of_geom[other]
+            number = int(self._link_of_geom[other])
             if model.geom_bodyid[one] != self._bar or number < 0 or contact.efc_address < 0:
                 continue
             mujoco.mj_contactForce(model, data, i, result)
             if result[0] <= 0.0:
                 continue
             total += result[0]
-            net += sign * contact.frame.reshape(3, 3).T @ result[:3]
-            touches.append((int(number), contact.pos.copy()))
-        axes = data.xmat[self._bar].reshape(3, 3)
-        centre = data.xpos[self._bar]
-        angles = []
-        for _, position in sorted(touches, key=lambda touch: touch[0]):
-            _, v, w = axes.T @ (position - centre)
-            angles.append(math.atan2(w, v))
-        turns = [math.remainder(b - a, math.tau) for a, b in zip(angles, angles[1:], strict=False)]
-        reached = np.cumsum([0.0, *turns])
-        return float(total), mjcf.up(net.tolist()), float(reached.max() - reached.min())
+            # the contact's frame points from its first geom to its second
+            net += (1.0 if bar_first else -1.0) * contact.frame.reshape(3, 3).T @ result[:3]
+            touching.add(number)
+        return float(total), mjcf.up(net.tolist()), self._span(touching)
+
+    def _span(self, touching: set[int]) -> float:
+        """Angle about the bar's axis from the first touching disk to the last, counted along the arm."""
+        if not touching:
+            return 0.0
+        data = self._data
+        disks = data.geom_xpos[self._disks[min(touching) : max(touching) + 1]]
+        _, y, z = data.xmat[self._bar].reshape(3, 3).T @ (disks - data.xpos[self._bar]).T
+        angles = np.unwrap(np.arctan2(z, y))
+        return float(abs(angles[-1] - angles[0]))
 
 
 def _matrix(w: float, x: float, y: float, z: float) -> Array:

@@ -19,6 +19,7 @@ from arm_companion.sim.servo_emulator import ServoEmulator
 _CONTROL_PERIOD_S = 0.002
 _SAMPLE_EVERY = 10  # control periods
 _MOST_BEHIND_S = 0.1
+_PERIODS_IN_ONE_GO = 3
 _TICKS_PER_RAD = 4096 / (2.0 * math.pi)
 
 
@@ -60,7 +61,9 @@ class World:
                 self.lost_s += (due - most) * _CONTROL_PERIOD_S
                 start += (due - most) * _CONTROL_PERIOD_S
                 due = most
-            for _ in range(due):
+            for i in range(due):
+                if i % _PERIODS_IN_ONE_GO == _PERIODS_IN_ONE_GO - 1:
+                    await asyncio.sleep(0)  # who is late still answers the servo bus in between
                 self._advance()
                 periods += 1
                 if periods % _SAMPLE_EVERY == 0:

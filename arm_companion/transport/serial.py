@@ -98,9 +98,7 @@ def open_serial(port: str, baud: int) -> Opener:
 
 
 def _prefer_latency(device: serial.Serial) -> None:
-    with contextlib.suppress(
-        OSError, ValueError, NotImplementedError
-    ):  # a pty and most UARTs know no such mode
+    with contextlib.suppress(OSError, ValueError, NotImplementedError):  # a pty and most UARTs know no such mode
         device.set_low_latency_mode(True)
     with contextlib.suppress(OSError, serial.SerialException):
         device.reset_input_buffer()

@@ -1,7 +1,10 @@
 """Laws of the perch's transition table, read from the table itself."""
 
+from pathlib import Path
+
 import pytest
 
+from arm_companion.mission.diagram import document
 from arm_companion.mission.facts import ArmFault, ArmFlag, Order
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.mission import SAFE_ACTION
@@ -83,3 +86,8 @@ def test_bits_are_those_of_the_dialect(ours: type[ArmFlag] | type[ArmFault], pre
 def test_phase_numbers_are_those_of_the_dialect() -> None:
     for phase in Phase:
         assert getattr(mav, f"ARM_STATE_{phase.name}") == phase.value
+
+
+def test_the_committed_diagram_is_the_table() -> None:
+    page = Path(__file__).parents[2] / "docs" / "perch_states.md"
+    assert page.read_text(encoding="utf-8") == document(), "python -m arm_companion.mission.diagram > docs/perch_states.md"

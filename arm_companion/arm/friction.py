@@ -1,0 +1,119 @@
+"""Friction of the tendons in their guides: why unloading does not retrace loading. Off unless asked for.
+
+A tendon that slides through guides loses tension by exp(-mu Theta), Theta the angle through which the guides have
+turned it (capstan). Along an arm bent by Theta its mean is off by Phi = 1 - (1 - exp(-mu Theta)) / (mu Theta),
+about mu Theta / 2, one way or the other by the direction of sliding, and anywhere in between while it sticks:
+
+    tau_arm = tau (1 - z Phi),   -1 <= z <= 1
+
+z is the memory. Tendon sliding towards its motor drives z to 1, away from it to -1; before it slides it stretches by
+tau Phi / k_T each way. That is a play operator per tendon: independent of rate, and it closes its loops.
+"""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from arm_companion.arm.model import ArmModel, ArmSolution, Payload
+from arm_companion.errors import NoSolution
+from arm_companion.geometry.arrays import Array, ArrayLike, frozen
+
+_ITERATIONS = 60
+_TOLERANCE = 1e-7  # of z
+
+
+@dataclass(frozen=True, eq=False)
+class Grip:
+    """The memory of the guides.
+
+    Attributes:
+        z: state of every tendon (n,), from -1 (sliding out into the arm) to 1 (sliding towards the motor).
+        path: path of every tendon inside the arm less its straight length when that was so (n,), m.
+    """
+
+    z: Array
+    path: Array
+
+    @classmethod
+    def relaxed(cls, solution: ArmSolution) -> "Grip":
+        """After shaking: no friction anywhere."""
+        return cls(np.zeros(solution.tension.size), -solution.detail.path_beyond(0.0))
+
+
+def loss(mu: float, turn: float) -> float:
+    """Phi: share by which the mean tension of a sliding tendon is off, guides turning it by `turn`, rad."""
+    x = mu * turn
+    return 0.5 * x * (1 - x / 3 * (1 - x / 4)) if x < 1e-3 else 1 + math.expm1(-x) / x
+
+
+def turning(solution: ArmSolution, points: int = 33) -> float:
+    """Angle through which the backbone turns from base to tip, rad, there and back counted twice."""
+    rotation, _ = solution.detail.sections(np.linspace(0.0, solution.arc_length, points))
+    t = rotation[:, :, 2]
+    cosine = np.clip((t[1:] * t[:-1]).sum(axis=1), -1.0, 1.0)
+    sine = np.sqrt((np.cross(t[1:], t[:-1]) ** 2).sum(axis=1))
+    return float(np.arctan2(sine, cosine).sum())
+
+
+def step(
+    model: ArmModel,
+    mu: float,
+    before: Grip,
+    pull: ArrayLike,
+    gravity: ArrayLike,
+    tip_wrench: ArrayLike | None = None,
+    payload: Payload | None = None,
+    *,
+    start: ArmSolution | None = None,
+) -> tuple[ArmSolution, Grip]:
+    """Equilibrium of a free tip with friction, coming from what the guides remember.
+
+    The tensions of the solution are those that act on the arm.
+
+    Args:
+        model: without friction.
+        mu: Coulomb coefficient of tendon on guide.
+        before: memory of the equilibrium before.
+        pull: tendon goals (n,), m.
+        gravity: (3,), m/s^2, base axes.
+        tip_wrench: dead load at the tip (6,), base axes.
+        payload: what the tip carries.
+        start: a neighbouring solution.
+
+    Raises:
+        NoSolution: when the model has none, or memory and equilibrium do not agree.
+        LimitViolated: as `ArmModel.free`.
+    """
+    P = model.parameters
+    q = frozen(pull, (P.n,), "pull")
+    z = before.z
+    solution = start or model.free(q, gravity, tip_wrench, payload)
+    for attempt in range(_ITERATIONS):
+        Phi = loss(mu, turning(solution))
+        # tau = k_T stretch without friction; the arm sees tau (1 - z Phi), as if less had been pulled in.
+        path = -solution.detail.path_beyond(0.0)
+        free = np.maximum(P.T0 + P.k_T * (q + path), 0.0)
+        solution = model.free(q - z * Phi * free / P.k_T, gravity, tip_wrench, payload, start=solution)
+        path = -solution.detail.path_beyond(0.0)
+        reach = np.maximum(free * Phi / P.k_T, 1e-9)
+        target = np.clip(before.z - (path - before.path) / reach, -1.0, 1.0)
+        if float(np.abs(target - z).max()) < _TOLERANCE:
+            return solution, Grip(target, path)
+        # The tendon's own stiffness closes this loop; damping keeps it from hunting about a kink.
+        z = z + (0.7 if attempt < _ITERATIONS // 2 else 0.3) * (target - z)
+    raise NoSolution(float(np.abs(target - z).max()), "friction and equilibrium do not agree")
+
+
+def cycle(
+    model: ArmModel, mu: float, pull: ArrayLike, gravity: ArrayLike, tip_wrenches: Iterable[ArrayLike]
+) -> list[ArmSolution]:
+    """Equilibria of one load after the other, from a relaxed arm: loading and unloading branches of a test."""
+    solution = model.free(pull, gravity)
+    grip = Grip.relaxed(solution)
+    path = []
+    for wrench in tip_wrenches:
+        solution, grip = step(model, mu, grip, pull, gravity, wrench, start=solution)
+        path.append(solution)
+    return path

@@ -1,0 +1,138 @@
+"""One question to the model: an arm, tendon goals, a field, and a load or a clamp."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arm_companion.arm import reaction
+from arm_companion.arm.model import ArmSolution, HoldKind, Payload
+from arm_companion.arm.parameters import ArmParameters, Guides
+from arm_companion.arm.rod_model import RodModel
+from arm_companion.config import Config
+from arm_companion.geometry import so3
+from arm_companion.geometry.arrays import Array, frozen, sealed
+from arm_companion.geometry.se3 import Pose
+
+GRAVITY = 9.81
+"""Field of the reference tables, m/s^2; the daemon flies with the standard 9.80665."""
+
+_NOTHING = (0.0, 0.0, 0.0)
+
+
+def arm(config: Config, guides: Guides = Guides.CONTINUOUS, pretension: float | None = None) -> ArmParameters:
+    """The configured arm, with another pretension, N, when one is given."""
+    parameters = ArmParameters.of(config.arm, guides)
+    if pretension is None:
+        return parameters
+    return replace(parameters, tendons=tuple(replace(t, T0=pretension) for t in parameters.tendons))
+
+
+def bend(theta_deg: float, delta_deg: float = 0.0) -> Array:
+    """u (2,), rad, of the paper's psi in degrees."""
+    theta, delta = math.radians(theta_deg), math.radians(delta_deg)
+    return np.array((theta * math.cos(delta), theta * math.sin(delta)))
+
+
+def field(config: Config, *, on: bool, attitude_deg: Sequence[float] | None = None) -> Array:
+    """Gravity (3,), m/s^2, base axes.
+
+    Args:
+        config: for the mount, when there is an attitude.
+        on: zero field when false.
+        attitude_deg: roll, pitch and yaw of the vehicle; along +z of the base (the arm hangs) when None.
+    """
+    if not on:
+        return np.zeros(3)
+    if attitude_deg is None:
+        return np.array((0.0, 0.0, GRAVITY))
+    R_wb = so3.from_rpy(*(math.radians(angle) for angle in attitude_deg))
+    return reaction.gravity_in_base(R_wb, reaction.mount(config.mount.position_m, config.mount.rpy_deg), GRAVITY)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """An arm with its motors locked.
+
+    Attributes:
+        model: mechanics.
+        pull: tendon goals (n,), m.
+        gravity: (3,), m/s^2, base axes.
+        payload: what a free tip carries.
+    """
+
+    model: RodModel
+    pull: Array
+    gravity: Array
+    payload: Payload | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "pull", frozen(self.pull, (self.model.parameters.n,), "pull"))
+        object.__setattr__(self, "gravity", frozen(self.gravity, (3,), "gravity"))
+
+    def free(
+        self,
+        force: Sequence[float] = _NOTHING,
+        moment: Sequence[float] = _NOTHING,
+        *,
+        follower: bool = False,
+        start: ArmSolution | None = None,
+    ) -> ArmSolution:
+        """Equilibrium with a free tip.
+
+        Args:
+            force: on the tip (3,), N.
+            moment: on the tip (3,), N m.
+            follower: whether force and moment are in tip axes and turn along; base axes and dead otherwise.
+            start: a neighbouring solution.
+
+        Raises:
+            ModelError: when it has none that the model may show.
+        """
+        load = np.array((*force, *moment), dtype=np.float64)
+        if not load.any():
+            return self.model.free(self.pull, self.gravity, payload=self.payload, start=start)
+        if follower:
+            return self.model.free(self.pull, self.gravity, payload=self.payload, follower_wrench=load, start=start)
+        return self.model.free(self.pull, self.gravity, load, self.payload, start=start)
+
+    def held(
+        self,
+        base_move: Sequence[float],
+        kind: HoldKind = HoldKind.CLAMPED,
+        *,
+        base_turn: Sequence[float] = _NOTHING,
+        unloaded: ArmSolution | None = None,
+        start: ArmSolution | None = None,
+    ) -> ArmSolution:
+        """Equilibrium with the tip held where it was when the arm was free, and the base moved since.
+
+        Args:
+            base_move: of the base point (3,), m, in the base axes before the move.
+            kind: what is held of the tip.
+            base_turn: of the base about its own point: roll, pitch, yaw (3,), rad. Gravity is the one after it.
+            unloaded: the free arm, when already known.
+            start: a neighbouring solution.
+
+        Raises:
+            ModelError: when it has none that the model may show.
+        """
+        before = self.free() if unloaded is None else unloaded
+        R = so3.from_rpy(*base_turn)
+        moved = Pose(R, np.asarray(base_move, dtype=np.float64))
+        hold = before.hold(self.model.parameters.L, kind).seen_from(moved.inverse())
+        return self.model.held(self.pull, hold, self.gravity, start=start)
+
+
+def stiffness(compliance: Array) -> Array:
+    """Force per tip displacement (3, 3), N/m, base axes, tip free to turn: the inverse where there is one.
+
+    An inextensible arm cannot give along a straight backbone. Such directions are left out (zero), as in a
+    pseudo-inverse: their stiffness is not finite.
+    """
+    C = 0.5 * (compliance[:3, :3] + compliance[:3, :3].T)
+    give, axes = np.linalg.eigh(C)
+    kept = give > 1e-9 * give.max()
+    inverse = np.divide(1.0, give, out=np.zeros(3), where=kept)
+    return sealed(axes @ (inverse[:, None] * axes.T))
