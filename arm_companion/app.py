@@ -32,6 +32,7 @@ from arm_companion.transport.urls import open_url
 
 log = logging.getLogger(__name__)
 
+_REARM_EVERY_S = 1.0
 _LEVELS = {
     Severity.CRITICAL: logging.CRITICAL,
     Severity.ERROR: logging.ERROR,
@@ -90,6 +91,7 @@ class Daemon:
         self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
         self._state = State()
         self._bar: Bar | None = None
+        self._rearm_at = 0.0
         self._last: Commands | None = None
         self.cycles = 0
         self.missed = 0
@@ -148,9 +150,23 @@ class Daemon:
     async def _observe(self) -> Facts:
         servos = await self._bus.read()
         now = self._clock.now()
+        if any(servo.tripped for servo in servos) and now >= self._rearm_at:
+            self._rearm_at = now + _REARM_EVERY_S
+            await self._rearm()
         requests, bar = self._component.take()
         self._bar = bar or self._bar
         return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
+
+    async def _rearm(self) -> None:
+        """Servos stopped where they were because the bus was silent; goals go on from there."""
+        text = "servo bus was silent too long: servos held, goals go on from where they are"
+        log.warning(text)
+        self._component.notify(Notice(Severity.WARNING, text))
+        self._tendons.rest()
+        try:
+            await self._bus.start()
+        except* DeviceFault as faults:
+            log.error("re-arming: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
 
     async def _act(self, commands: Commands, facts: Facts, now: float) -> None:
         """Servos first: they are what a late cycle hurts most."""

@@ -6,6 +6,7 @@ as far as two degrees of freedom allow. It serves for comparison; the rod flies.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -186,15 +187,18 @@ class _Detail:
         for name in ("EI", "GJ", "k_T", "T0"):
             up, down = P.scaled(**{name: 1 + _STEP}), P.scaled(**{name: 1 - _STEP})
             relative[name] = sealed(self._difference((up, self.point), (down, self.point))[:6])
-        tension = statics.stretch_tension(self.P, self.u, self.point[:n] - self.beyond)
+        g = self.point[n : n + 3]
+        loads = _Loads.of(self.P, g, self.tip_wrench, self.end_mass)
+        _, K = _force_and_stiffness(self.P, self.u, self.point[:n] - self.beyond, loads)
+        J = arc.jacobian(self.u, self.P.L)
         return Derivatives(
             pull=sealed(D[:6, :n].copy()),
             gravity=sealed(D[:6, n : n + 3].copy()),
             hold=sealed(self.held * D[:6, n + 3 :]),
             tip_wrench=sealed((not self.held) * D[:6, n + 3 :]),
-            parameters=relative,
+            parameters=MappingProxyType(relative),
             tension=sealed(D[6:, n + 3 :].copy()),
-            compliance=sealed(stiffness.tip_compliance(self.P, self.u, tension, self.tip_wrench)),
+            compliance=sealed(np.asarray(J @ np.linalg.solve(K, J.T))),
         )
 
     def _difference(self, up: tuple[ArmParameters, Array], down: tuple[ArmParameters, Array]) -> Array:

@@ -276,7 +276,7 @@ def newton(
         steps += 1
     stable, apart = False, math.inf
     if status == 0:
-        if steps == 0 and not has_tangent:
+        if steps < 2 and (has_tangent or steps == 0):  # a neighbour's tangent says nothing about this equilibrium
             K = tangent(state, full, hung, stiffness, tables)
         stable = is_stable(K, C, limits)
         apart = imbalance(state, scale, tables)

@@ -21,7 +21,7 @@ from arm_companion.errors import NoSolution
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen
 
 _ITERATIONS = 60
-_TOLERANCE = 1e-7  # of z
+_TOLERANCE = 1e-5  # of z
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,8 @@ def step(
     q = frozen(pull, (P.n,), "pull")
     z = before.z
     solution = start or model.free(q, gravity, tip_wrench, payload)
-    for attempt in range(_ITERATIONS):
+    relaxation, last = 1.0, None
+    for _ in range(_ITERATIONS):
         Phi = loss(mu, turning(solution))
         # tau = k_T stretch without friction; the arm sees tau (1 - z Phi), as if less had been pulled in.
         path = -solution.detail.path_beyond(0.0)
@@ -99,10 +100,15 @@ def step(
         path = -solution.detail.path_beyond(0.0)
         reach = np.maximum(free * Phi / P.k_T, 1e-9)
         target = np.clip(before.z - (path - before.path) / reach, -1.0, 1.0)
-        if float(np.abs(target - z).max()) < _TOLERANCE:
+        rest = target - z
+        if float(np.abs(rest).max()) < _TOLERANCE:
             return solution, Grip(target, path)
-        # The tendon's own stiffness closes this loop; damping keeps it from hunting about a kink.
-        z = z + (0.7 if attempt < _ITERATIONS // 2 else 0.3) * (target - z)
+        # Aitken's relaxation: the tendon's own stiffness closes this loop with a gain of either sign.
+        if last is not None:
+            change = rest - last
+            relaxation *= -float(last @ change) / max(float(change @ change), 1e-18)
+            relaxation = min(max(relaxation, 0.2), 1.5)
+        z, last = z + relaxation * rest, rest
     raise NoSolution(float(np.abs(target - z).max()), "friction and equilibrium do not agree")
 
 

@@ -9,6 +9,8 @@ centre of the section it acts on.
 """
 
 import enum
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Protocol
@@ -68,6 +70,23 @@ class Hold:
         object.__setattr__(self, "pivot", frozen(self.pivot, (3,), "pivot"))
         if self.beyond is not None:
             object.__setattr__(self, "beyond", frozen(self.beyond, (-1,), "beyond"))
+
+    def room(self, direction: ArrayLike) -> float:
+        """How far the base may move along `direction` (3,), base axes, until the backbone is straight, m.
+
+        Counted from the pose of the held section; negative when that is out of reach already. Forces grow without
+        bound on the last millimetre or two of it.
+        """
+        e = np.asarray(direction, dtype=np.float64)
+        length = math.sqrt(float(e @ e))
+        if not length > 0:
+            raise ValueError("the direction has no length")
+        p = self.pose.position
+        along = float(p @ e) / length
+        across2 = max(0.0, float(p @ p) - along * along)
+        if across2 >= self.arc_length**2:
+            return -math.inf
+        return along + math.sqrt(self.arc_length**2 - across2)
 
     def seen_from(self, T_now_then: Pose) -> "Hold":
         """The same hold in the axes of a base that has moved: `T_now_then` maps old base axes to new ones."""
@@ -136,7 +155,7 @@ class Derivatives:
     gravity: Array
     hold: Array
     tip_wrench: Array
-    parameters: dict[str, Array]
+    parameters: Mapping[str, Array]
     tension: Array
     compliance: Array
 

@@ -125,13 +125,13 @@ class Validity:
         residual: largest allowed.
         taut_margin: least allowed, m.
         age: oldest allowed input, s.
-        condition: largest allowed sigma of the force, N.
+        force_sigma: largest allowed of any component of the force, N.
     """
 
     residual: float = 1e-3
     taut_margin: float = 5e-4
     age: float = 0.25
-    condition: float = math.inf
+    force_sigma: float = math.inf
 
     def refusal(self, solution: ArmSolution, sigma: Array, age: float) -> str:
         """Why the reaction of this solution may not be acted upon; empty when it may."""
@@ -141,7 +141,7 @@ class Validity:
             return f"{solution.taut_margin * 1e3:.2f} mm from taut"
         if not age <= self.age:
             return f"inputs are {age:.2f} s old"
-        if math.isfinite(self.condition) and not float(sigma[:3].max()) <= self.condition:
+        if math.isfinite(self.force_sigma) and not float(sigma[:3].max()) <= self.force_sigma:
             return f"one sigma of {float(sigma[:3].max()):.2g} N"
         return ""
 

@@ -1,6 +1,7 @@
 """What a solved rod can tell on demand: its shape, where its mass is, and how its base wrench responds."""
 
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -134,7 +135,7 @@ class RodDetail:
             gravity=sealed(gravity),
             hold=sealed(hold),
             tip_wrench=sealed(tip),
-            parameters={name: sealed(D[:, n + 3 + k].copy()) for k, name in enumerate(names)},
+            parameters=MappingProxyType({name: sealed(D[:, n + 3 + k].copy()) for k, name in enumerate(names)}),
             tension=sealed((problem.stiffness * taut)[:, None] * (cables.path @ moved)),
             compliance=sealed(compliance),
         )

@@ -162,7 +162,7 @@ class Solved:
         ends: the rod's ends and tensions there.
         iterations: Newton steps taken, all in all.
         residual: of Newton's own stop test.
-        tangent: from the last Newton step, so a little old; None when there was none.
+        tangent: from the last Newton step, so a little old; None when there was none of its own.
         held: derivative of the support's constraints (size, k); None without a support.
         stable: whether it is; None when that was not looked at.
         imbalance: between the modes; None when that was not looked at.
@@ -207,7 +207,7 @@ def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array |
         found: Solved | str = rod.compiled_newton(problem, c, wrench, tangent)
         return found
     support, L, last = problem.support, rod.s, math.inf
-    K, C = tangent, None
+    K, C, own = tangent, None, False
     for iteration in range(ITERATIONS):
         loads = problem.loads_with(wrench)
         try:
@@ -223,12 +223,13 @@ def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array |
             error /= rod.moment_scale + _largest(wrench) * L
             error = max(error, _largest(gap[:3]) / L, _largest(gap[3:]))
         if error < TOLERANCE:
-            return Solved(rod, problem, c, wrench, state, iteration, error, K, C)
+            # A neighbour's tangent says nothing about the stability of this equilibrium.
+            return Solved(rod, problem, c, wrench, state, iteration, error, K if own else None, C)
         if not error < 1e3 * max(last, 1e-3):
             return NO_CONVERGENCE
         last = error
         if K is None or iteration > 0:
-            K = rod.tangent(state, loads, problem.stiffness)
+            K, own = rod.tangent(state, loads, problem.stiffness), True
         try:
             if support is None or gap is None or C is None:
                 step, push = np.asarray(np.linalg.solve(K, state.residual)), wrench

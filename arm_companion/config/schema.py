@@ -161,7 +161,7 @@ class LimitsConfig:
     tension_max_n: float = option("greatest tension of any tendon", 45.0, unit="N", lower=1.0, upper=500.0)
     pull_max_m: float = option("tendon taken in or let out, from straight", 0.12, unit="m", lower=0.001, upper=2.0)
     pull_speed_m_per_s: float = option("tendon speed", 0.05, unit="m/s", lower=0.001, upper=1.0)
-    bend_max_rad: float = option("commanded bend of the free arm", 5.5, unit="rad", lower=0.1, upper=4 * math.pi)
+    bend_max_rad: float = option("commanded bend of the free arm", 5.1, unit="rad", lower=0.1, upper=4 * math.pi)
     wrench_force_n: float = option("predicted force on the airframe", 12.0, unit="N", lower=0.1, upper=500.0)
     wrench_moment_nm: float = option("predicted moment on the airframe", 2.5, unit="N m", lower=0.01, upper=200.0)
     vehicle_speed_m_per_s: float = option("set-point speed near the bar", 0.3, unit="m/s", lower=0.01, upper=5.0)
@@ -201,10 +201,10 @@ class PerchConfig:
         lower=0.05,
         upper=20.0,
     )
-    wrap_bend_rad: float = option("commanded bend of the full wrap", 4.7, unit="rad", lower=0.5, upper=12.0)
+    wrap_bend_rad: float = option("commanded bend of the full wrap", 4.9, unit="rad", lower=0.5, upper=12.0)
     free_arc_m: float = option(
         "effective arc length between base and bar of the wrapped arm, which acts as a spring",
-        0.18,
+        0.08,
         unit="m",
         lower=0.01,
         upper=3.0,
@@ -214,11 +214,11 @@ class PerchConfig:
     )
     bend_speed_rad_per_s: float = option("bending and unbending", 0.9, unit="rad/s", lower=0.01, upper=10.0)
     grip_tension_n: float = option(
-        "tension of the tightest tendon that means gripped", 12.0, unit="N", lower=1.0, upper=200.0
+        "tension of the tightest tendon that means gripped; a free arm at the full wrap has less", 21.5, unit="N", lower=1.0, upper=200.0
     )
     verify_pull_m: float = option("set-point offset of the pull test", 0.05, unit="m", lower=0.005, upper=0.5)
     verify_give_share: float = option(
-        "share of that offset which a good grip gives at most", 0.5, lower=0.05, upper=0.95
+        "share of that offset which a good grip gives at most", 0.3, lower=0.05, upper=0.95
     )
     jog_max_m: float = option("largest move of the anchored vehicle", 0.03, unit="m", lower=0.001, upper=0.2)
     contact_timeout_s: float = option("time for the reach", 40.0, unit="s", lower=1.0, upper=300.0)

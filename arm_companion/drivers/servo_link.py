@@ -16,7 +16,7 @@ from arm_companion.transport.base import Transport
 _BITS_PER_BYTE = 10
 _TURNAROUND_S = 50e-6  # a servo's own time to begin an answer
 _TRIES = 4
-_DRAIN_S = 0.02  # longer than the latency timer of an adapter as it comes from the factory
+DRAIN_S = 0.02  # longer than the latency timer of an adapter as it comes from the factory
 _LATE_S = 0.005
 _LATEST_S = 0.1  # what comes later answers nothing any more
 
@@ -162,7 +162,7 @@ class ServoLink:
         """
         for attempt in range(tries):
             if attempt:
-                await asyncio.sleep(_DRAIN_S)
+                await asyncio.sleep(DRAIN_S)
             deadline = asyncio.get_running_loop().time() + self._timeout_s
             answers = await self.ask(request, (servo,), size, deadline)
             if servo in answers:

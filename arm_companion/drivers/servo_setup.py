@@ -1,9 +1,10 @@
 """Bringing one servo into the state that the arm needs, without ever letting go of what it holds."""
 
+import asyncio
 from dataclasses import dataclass
 
 from arm_companion.drivers.servo_health import ServoRecord
-from arm_companion.drivers.servo_link import ServoLink
+from arm_companion.drivers.servo_link import DRAIN_S, ServoLink
 from arm_companion.errors import DeviceFault
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
@@ -68,6 +69,9 @@ async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> Se
     model, firmware = await identify(link, servo)
     await _make_talkative(link, servo)
     record.error_bits = await link.read(servo, ct.HARDWARE_ERROR_STATUS)
+    if record.error_bits:  # answers carry no address, and a late one to an earlier question may pass for this
+        await asyncio.sleep(DRAIN_S)
+        record.error_bits = await link.read(servo, ct.HARDWARE_ERROR_STATUS)
     record.torque = await link.read(servo, ct.TORQUE_ENABLE) == 1
     if record.error_bits:
         raise DeviceFault(servo, record.error_bits, "hardware error; it needs a reboot")

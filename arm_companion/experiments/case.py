@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from arm_companion.arm import reaction
+from arm_companion.arm import arc, reaction, statics
+from arm_companion.arm import stiffness as arc_stiffness
 from arm_companion.arm.model import ArmSolution, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 from arm_companion.arm.rod_model import RodModel
@@ -19,6 +20,7 @@ GRAVITY = 9.81
 """Field of the reference tables, m/s^2; the daemon flies with the standard 9.80665."""
 
 _NOTHING = (0.0, 0.0, 0.0)
+_STRAIGHT = 1e-9  # rad, under which the bend has no direction of its own
 
 
 def arm(config: Config, guides: Guides = Guides.CONTINUOUS, pretension: float | None = None) -> ArmParameters:
@@ -111,15 +113,15 @@ class Case:
         Args:
             base_move: of the base point (3,), m, in the base axes before the move.
             kind: what is held of the tip.
-            base_turn: of the base about its own point: roll, pitch, yaw (3,), rad. Gravity is the one after it.
+            base_turn: of the base about its own point: roll, pitch, yaw (3,), rad. `gravity` is in the axes after it.
             unloaded: the free arm, when already known.
             start: a neighbouring solution.
 
         Raises:
             ModelError: when it has none that the model may show.
         """
-        before = self.free() if unloaded is None else unloaded
         R = so3.from_rpy(*base_turn)
+        before = replace(self, gravity=R @ self.gravity).free() if unloaded is None else unloaded
         moved = Pose(R, np.asarray(base_move, dtype=np.float64))
         hold = before.hold(self.model.parameters.L, kind).seen_from(moved.inverse())
         return self.model.held(self.pull, hold, self.gravity, start=start)
@@ -136,3 +138,28 @@ def stiffness(compliance: Array) -> Array:
     kept = give > 1e-9 * give.max()
     inverse = np.divide(1.0, give, out=np.zeros(3), where=kept)
     return sealed(axes @ (inverse[:, None] * axes.T))
+
+
+def k_psi(solution: ArmSolution, parameters: ArmParameters, delta: float = 0.0) -> Array:
+    """The paper's K_psi, its sign put right, at the solution's mean bend (2, 2), N m/rad; one segment.
+
+    K_psi = H - [dJ_q^T/dpsi] tau + J_q^T K_q J_q - [dJ_x^T/dpsi] w over taut tendons (the paper's eq. 16 prints a
+    minus before the third term and leaves the last out). Here by the chain rule from u = theta (cos delta,
+    sin delta): T^T K_u T + g . d2u/dpsi2, with g the force on u that backbone, tendons and tip load leave. The
+    arm's weight does not count, and a tip load counts as dead.
+
+    Args:
+        solution: whose bend, tensions and tip wrench are taken.
+        parameters: the arm.
+        delta: direction of the bending plane where the arm is straight and has none, rad.
+    """
+    x, y = solution.bend[:2].tolist()
+    theta = math.hypot(x, y)
+    if theta > _STRAIGHT:
+        delta = math.atan2(y, x)
+    along, across = np.array((math.cos(delta), math.sin(delta))), np.array((-math.sin(delta), math.cos(delta)))
+    u, tau, w = theta * along, solution.tension, solution.tip_wrench
+    g = statics.bending_moment(parameters, u, tau) - arc.jacobian(u, parameters.L).T @ w
+    T = np.column_stack((along, theta * across))
+    turning = np.array(((0.0, g @ across), (g @ across, -theta * (g @ along))))
+    return sealed(T.T @ arc_stiffness.bend_stiffness(parameters, u, tau, w) @ T + turning)

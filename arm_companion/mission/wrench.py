@@ -8,21 +8,23 @@ import numpy as np
 
 from arm_companion.arm import arc
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind
-from arm_companion.arm.reaction import BodyMotion, Reaction, Spread, reaction
+from arm_companion.arm.reaction import GRAVITY, BodyMotion, Reaction, Spread, reaction
 from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Vec3, WrenchReport, WrenchSource
-from arm_companion.mission.motion import ZERO, norm, sub
+from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
 _LEAST_HZ = 5.0
-# the vehicle's position since the grip is known to a few millimetres, and where the wrap ends is not sharp
-_SPREAD = Spread(hold_position=0.003, hold_rotation=0.03)
+# the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
+_FELT_SIGMA = (0.3, 0.3, 1.5)  # N
+_MOMENT_SIGMA = 0.15  # N m, of what the bar passes on besides the force
+_SPREAD = Spread(hold_position=0.005, hold_rotation=0.03)
 _NAN3: Vec3 = (math.nan, math.nan, math.nan)
 
 
@@ -87,12 +89,15 @@ def anchored(s: Situation, position_w: Vec3, start: ArmSolution | None) -> ArmSo
 def _hold(s: Situation, anchor: Anchor) -> Hold:
     """The grip in base axes of the moment in which it was taken.
 
-    A closed wrap grips with its last part, so that the arm up to there is free; friction keeps it from rolling.
+    A closed wrap rolls and turns on the bar but stays on it: what holds is the point on the bar's axis.
     """
+    x, y = s.towards_bar_a
+    centre = s.bar.radius + s.config.perch.disk_radius_m
     return Hold(
         s.config.perch.free_arc_m,
         Pose.of_quaternion(anchor.section_attitude_as, np.asarray(anchor.section_position_a)),
-        HoldKind.CLAMPED,
+        HoldKind.PINNED,
+        pivot=np.array((centre * x, centre * y, 0.0)),
         beyond=np.asarray(anchor.beyond) if anchor.beyond else None,
     )
 
@@ -117,28 +122,65 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
         )
     except ModelError:
         return _nothing(source)
+    if holding:
+        found = _weigh(found, s, solution)
     # how the bar pushes on an arm that touches but does not hold is not known
     return _report(found, source, valid=source is not WrenchSource.CONTACT)
 
 
-def _lean(s: Situation, start: ArmSolution | None) -> Vec3:
+def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
+    """Model and motion, each axis by its variance: a millimetre is half a newton, but the vehicle feels a tenth.
+
+    What the vehicle feels comes from the force observer, north and east. Down, where no sensor tells the thrust,
+    stands what a wrap on a bar can hold before it slides: the arm's weight, give or take a newton and a half.
+    """
+    R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
+    model = R_wb @ found.wrench[:3]
+    model_variance = R_wb**2 @ found.sigma[:3] ** 2
+    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY))
+    felt_variance = np.square(_FELT_SIGMA)
+    share = felt_variance / (felt_variance + model_variance)
+    force = R_wb.T @ (share * model + (1.0 - share) * felt)
+    sigma = np.sqrt(R_wb.T**2 @ (share * model_variance))
+    arm = s.mount.position
+    torque = found.wrench[3:] + np.cross(arm, force - found.wrench[:3])
+    lever = np.sqrt(np.square(so3.hat(arm)) @ sigma**2)
+    return replace(
+        found,
+        wrench=np.concatenate((force, torque)),
+        sigma=np.concatenate((sigma, np.minimum(found.sigma[3:], np.hypot(lever, _MOMENT_SIGMA)))),
+    )
+
+
+def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:
     """Acceleration that holds the vehicle at its reference against the anchored arm, m/s^2, world axes.
 
     From the force at the *reference*: a force measured where the vehicle is would cancel the arm's own
-    stiffness, which is positive feedback.
+    stiffness, which is positive feedback. A multirotor leans to accelerate, and leaning swings the arm's base,
+    so both act: with the arm's stiffness S at its base, the wanted move x of the centre of mass, base offset r
+    and the tilt `phi = (-z) x a / g` that the acceleration a takes,
+
+        m a + S_f (x + phi x r, phi) = 0.
     """
     reference, anchor = s.state.reference, s.state.anchor
-    if s.state.phase is not Phase.PERCHED or reference is None or anchor is None:
+    if s.state.phase is not Phase.PERCHED or reference is None or anchor is None or solution is None:
         return ZERO
-    if norm(sub(reference.position, anchor.position_w)) == 0.0:
+    move = np.asarray(sub(reference.position, anchor.position_w))
+    if not move.any():
         return ZERO
     try:
-        there, here = (anchored(s, at, start) for at in (reference.position, anchor.position_w))
+        S = solution.base_stiffness[:3]
     except ModelError:
         return ZERO
-    force_b = s.mount.rotation @ (there.base_wrench[:3] - here.base_wrench[:3])
-    lean = so3.from_quaternion(s.facts.vehicle.attitude_wb) @ force_b / -s.config.vehicle.mass_kg
-    return _vec3(lean)
+    R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
+    R_wa = R_wb @ s.mount.rotation
+    S_move, S_turn = (R_wa @ S[:, half] @ R_wa.T for half in (slice(0, 3), slice(3, 6)))
+    tilt = so3.hat((0.0, 0.0, -1.0)) / GRAVITY
+    swing = -so3.hat(R_wb @ s.mount.position) @ tilt
+    A = s.config.vehicle.mass_kg * np.eye(3) + S_move @ swing + S_turn @ tilt
+    north, east, _ = -np.linalg.solve(A, S_move @ move)
+    # up and down the autopilot's own loop is stiff and integrates, and a wrap pushed hard there slides
+    return float(north), float(east), 0.0
 
 
 def _tip(s: Situation) -> Vec3:

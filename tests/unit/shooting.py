@@ -56,7 +56,7 @@ def shoot(parameters: ArmParameters, solution: ArmSolution, payload: Payload | N
         gap2 = (segment.L / segment.disks) ** 2 / 24 if P.guides is Guides.DISKS else 0.0
         guess = [np.zeros(3)]
 
-        def slope(s, y, tau=tau, offsets=offsets, segment=segment, gap2=gap2, guess=guess):  # noqa: ARG001
+        def slope(s, y, tau=tau, offsets=offsets, segment=segment, gap2=gap2, guess=guess):
             R, n, m = y[3:12].reshape(3, 3), y[12:15], y[15:18]
             kappa = guess[0] = _curvature(R.T @ m, tau, offsets, segment.EI, segment.GJ, gap2, guess[0])
             strand = np.array([0.0, 0.0, 1.0]) + np.cross(kappa, offsets)

@@ -71,9 +71,7 @@ def test_what_the_tip_cannot_reach_is_refused(target):
 def test_acceleration_of_a_moving_tip(theta, delta, v, a):
     u, velocity, change, h = paper.bend_of(theta, delta), np.array((v, 0.4)), np.array((a, -0.3)), 1e-4
     where = [arc.tip_position(u + t * velocity + 0.5 * t * t * change, L) for t in (-h, 0, h)]
-    assert np.allclose(
-        arc.acceleration(u, velocity, change, L), (where[0] - 2 * where[1] + where[2]) / h**2, atol=1e-6
-    )
+    assert np.allclose(arc.acceleration(u, velocity, change, L), (where[0] - 2 * where[1] + where[2]) / h**2, atol=1e-6)
 
 
 @given(bends, angles)
@@ -225,8 +223,8 @@ def test_an_arm_that_cannot_bend_every_way_is_refused():
 
 
 def test_parameters_of_the_configuration():
-    assert P.EI == pytest.approx(0.019301945263655692)
-    assert P.GJ == pytest.approx(0.014512740799741122)
+    assert pytest.approx(0.019301945263655692) == P.EI
+    assert pytest.approx(0.014512740799741122) == P.GJ
     assert P.k_T == pytest.approx(np.full(4, 3231.352443692358), rel=1e-5)
     assert P.segments[0].line_mass == pytest.approx(0.12296849447401867)
     assert P.mass == pytest.approx(0.036742123618504666)
