@@ -306,7 +306,7 @@ def _weighted(problem: _Problem, start: Mapping[str, float]) -> _Solved:
         predicted = problem.measured + r / weight
         J = J / weight[:, None]
         old, scatter = scatter, problem.scatter(predicted, len(names))
-        if all(abs(scatter[kind] / old[kind] - 1) < 0.02 for kind in scatter):
+        if len(scatter) == 1 or all(abs(scatter[kind] / old[kind] - 1) < 0.02 for kind in scatter):
             break
     weight = 1 / np.array([scatter[kind] for kind in problem.channels])
     information = (J * weight[:, None]).T @ (J * weight[:, None])

@@ -22,7 +22,7 @@ def levenberg_marquardt(
     """The x >= lower that makes the sum of squares of `residual(x)` least.
 
     Returns:
-        x (p,), residual (q,) and Jacobian (q, p) there, by forward differences.
+        x (p,), residual (q,) there and Jacobian (q, p) by forward differences, at most one converged step old.
 
     Raises:
         NoSolution: when it does not settle.
@@ -45,13 +45,15 @@ def levenberg_marquardt(
             r_trial = residual(trial)
         except ModelError:
             r_trial = np.full_like(r, np.inf)
-        if float(r_trial @ r_trial) < float(r @ r):
+        better = float(r_trial @ r_trial) < float(r @ r)
+        if better:
             x, r, damping = trial, r_trial, max(damping / 10, 1e-9)
-            J = _jacobian(residual, x, r, step)
-        elif move >= _CONVERGED:
-            damping *= 10
         if move < _CONVERGED:
             return x, r, J
+        if better:
+            J = _jacobian(residual, x, r, step)
+        else:
+            damping *= 10
     raise NoSolution(move, "the fit does not settle")
 
 

@@ -14,12 +14,16 @@ from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
-_SCENARIOS = ("perch",)
+_SCENARIOS = ("perch", "world")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion sim`."""
-    parser.add_argument("scenario", choices=_SCENARIOS, help="perch: take off, wrap a bar, be pulled, let go, land")
+    parser.add_argument(
+        "scenario",
+        choices=_SCENARIOS,
+        help="perch: take off, wrap a bar, be pulled, let go, land; world: no script, your own ground station flies",
+    )
     add_config_arguments(parser, default="sim.toml")
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
@@ -45,7 +49,28 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.seed is not None:
         arguments.settings.append(f"sim.seed={arguments.seed}")
     config = load_from(arguments)
-    return _fly(arguments, config)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
+
+
+def _serve(arguments: argparse.Namespace, config: Config) -> int:
+    from arm_companion.clock import precise_loop  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.progress import Progress  # noqa: PLC0415
+    from arm_companion.sim.runner import serve  # noqa: PLC0415
+    from arm_companion.supervisor import stop_on_signals  # noqa: PLC0415
+
+    async def main() -> None:
+        stop = asyncio.Event()
+        restore = stop_on_signals(stop)
+        try:
+            say = Progress(sys.stdout).say
+            await serve(config, _daemon_words(arguments), arguments.output / "daemon.log", say, stop)
+        finally:
+            restore()
+
+    with asyncio.Runner(loop_factory=precise_loop) as runner:
+        runner.run(main())
+    return 0
 
 
 def _fly(arguments: argparse.Namespace, config: Config) -> int:
@@ -54,7 +79,6 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     from arm_companion.sim.verdict import judge  # noqa: PLC0415
 
     output: Path = arguments.output
-    output.mkdir(parents=True, exist_ok=True)
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
     try:
@@ -99,12 +123,17 @@ def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> 
     from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
-    path = _record_path(arguments)
-    words = ["run", "--config", arguments.config]
-    for setting in (*arguments.settings, f'record.file="{path.resolve()}"'):
-        words += ["--set", setting]
+    words = _daemon_words(arguments)
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+
+
+def _daemon_words(arguments: argparse.Namespace) -> list[str]:
+    """The daemon's command line: as in flight, with the settings of this run."""
+    words = ["run", "--config", arguments.config]
+    for setting in (*arguments.settings, f'record.file="{_record_path(arguments).resolve()}"'):
+        words += ["--set", setting]
+    return words
 
 
 def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from arm_companion.mission.motion import (
     Reference,
     add,
     clip_norm,
+    dot,
     follow,
     norm,
     ramp,
@@ -45,6 +46,8 @@ _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, P
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
+_NEAR_M = 0.15  # from here on the bar may be touched at any moment
+_FAR_FACTOR = 3.0
 _LEAN_RATE = 1.0  # m/s^3
 
 
@@ -209,7 +212,9 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
         case Phase.CONTACT:
             return _clear_of_bar(s), perch.reach_speed_m_per_s
         case Phase.REACH:
-            return s.place(-perch.overreach_m), perch.reach_speed_m_per_s
+            short = dot(sub(s.place(0.0), s.facts.vehicle.position_w), s.ahead)
+            hurry = _FAR_FACTOR if short > _NEAR_M else 1.0
+            return s.place(-perch.overreach_m), hurry * perch.reach_speed_m_per_s
         case Phase.VERIFY:
             return add(anchor, scale(s.ahead, -perch.verify_pull_m)), perch.verify_pull_m
         case _:

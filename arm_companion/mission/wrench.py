@@ -22,7 +22,8 @@ _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
 _LEAST_HZ = 5.0
 # the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
-_FELT_SIGMA = (0.3, 0.3, 1.5)  # N
+_FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes
+_SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides
 _MOMENT_SIGMA = 0.15  # N m, of what the bar passes on besides the force
 _SPREAD = Spread(hold_position=0.005, hold_rotation=0.03)
 _NAN3: Vec3 = (math.nan, math.nan, math.nan)
@@ -131,24 +132,24 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
 def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
     """Model and motion, each axis by its variance: a millimetre is half a newton, but the vehicle feels a tenth.
 
-    What the vehicle feels comes from the force observer, north and east. Down, where no sensor tells the thrust,
-    stands what a wrap on a bar can hold before it slides: the arm's weight, give or take a newton and a half.
+    What the vehicle feels comes from the force observer, north and east. Down, where no sensor tells the thrust
+    and where a wrap slides on its bar rather than stretch, stands the arm's weight, give or take what the bar's
+    friction holds. The bar passes on a moment besides the force that nothing measures; it is only in the sigma.
     """
     R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
     model = R_wb @ found.wrench[:3]
-    model_variance = R_wb**2 @ found.sigma[:3] ** 2
+    model_variance = R_wb**2 @ found.sigma[:3] ** 2 + np.square(_SLIDE_SIGMA)
     felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY))
     felt_variance = np.square(_FELT_SIGMA)
     share = felt_variance / (felt_variance + model_variance)
     force = R_wb.T @ (share * model + (1.0 - share) * felt)
     sigma = np.sqrt(R_wb.T**2 @ (share * model_variance))
     arm = s.mount.position
-    torque = found.wrench[3:] + np.cross(arm, force - found.wrench[:3])
     lever = np.sqrt(np.square(so3.hat(arm)) @ sigma**2)
     return replace(
         found,
-        wrench=np.concatenate((force, torque)),
-        sigma=np.concatenate((sigma, np.minimum(found.sigma[3:], np.hypot(lever, _MOMENT_SIGMA)))),
+        wrench=np.concatenate((force, so3.cross(arm, force))),
+        sigma=np.concatenate((sigma, np.hypot(lever, _MOMENT_SIGMA))),
     )
 
 

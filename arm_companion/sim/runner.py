@@ -13,6 +13,7 @@ from pathlib import Path
 from arm_companion.app import Daemon, Openers
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock
 from arm_companion.config.schema import Config
+from arm_companion.errors import ArmError
 from arm_companion.recorder import MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
@@ -39,7 +40,7 @@ class Result:
     records: list[Record] = dataclasses.field(default_factory=list)
 
 
-class DaemonDied(Exception):
+class DaemonDied(ArmError):
     """The daemon's process ended while it was needed."""
 
 
@@ -114,6 +115,37 @@ async def fly_real_time(
     if world.lost_s > 0.0:
         say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
     return Result(flight, failure)
+
+
+async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, stop: asyncio.Event) -> None:
+    """The world and the daemon without an operator, until `stop`: for a person with a ground station.
+
+    Args:
+        config: the configuration that the daemon is given too.
+        daemon_arguments: what follows `arm-companion` on its command line.
+        log: where the daemon's standard error goes.
+        say: told when it is ready.
+        stop: ends it.
+    """
+    world = World(config)
+    bus = EmulatedBus(world.servos, config.servos)
+    sim = config.sim
+    ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
+    async with _running(
+        world.run,
+        lambda: world.autopilot.run(open_url(sim.autopilot_url), ground),
+        lambda: bus.serve_pty(config.servos.port),
+    ):
+        await bus.wait_ready()
+        async with _daemon_process(daemon_arguments, log) as daemon:
+            say(f"autopilot talks to {sim.operator_autopilot_url}, arm to {sim.operator_arm_url}; Ctrl-C ends")
+            stopped = asyncio.create_task(stop.wait())
+            died = asyncio.create_task(daemon.wait())
+            await asyncio.wait({stopped, died}, return_when=asyncio.FIRST_COMPLETED)
+            stopped.cancel()
+            if died.done():
+                raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+            died.cancel()
 
 
 @contextlib.asynccontextmanager

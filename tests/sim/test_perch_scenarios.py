@@ -1,0 +1,146 @@
+"""Whole flights in simulated time: plant, autopilot stand-in, servos and daemon, joined by bytes alone."""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+
+import pytest
+
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
+from arm_companion.clock import run_simulated
+from arm_companion.config import load
+from arm_companion.mission.situation import Parameters
+from arm_companion.record_codec import dumps
+from arm_companion.recorder import replay
+from arm_companion.sim.runner import Result, fly_simulated
+from arm_companion.sim.verdict import Verdict, judge
+from arm_companion.sim.world import World
+
+CONFIG = load("sim.toml")
+
+
+def fly(prepare: Callable[[World], None] = lambda _: None, settings: tuple[str, ...] = ()) -> tuple[Result, Verdict]:
+    config = load("sim.toml", settings)
+    result = run_simulated(fly_simulated(config, lambda _: None, prepare))
+    return result, judge(result.flight, result.failure)
+
+
+@functools.cache
+def perch() -> tuple[Result, Verdict]:
+    """The undisturbed flight, flown once for all who look at it."""
+    return fly()
+
+
+def phases(result: Result) -> list[str]:
+    seen = [record.state.phase.name for record in result.records]
+    return [name for i, name in enumerate(seen) if i == 0 or seen[i - 1] != name]
+
+
+def test_a_perch_goes_through_every_phase_and_lets_go() -> None:
+    result, verdict = perch()
+    assert verdict.success, verdict.reason
+    passed = iter(phases(result))
+    wanted = (
+        "STOWED",
+        "READY",
+        "APPROACH",
+        "REACH",
+        "CONTACT",
+        "WRAP",
+        "VERIFY",
+        "PERCHED",
+        "UNLOAD",
+        "RELEASE",
+        "DEPART",
+    )
+    assert all(name in passed for name in (*wanted, "STOWED"))
+
+
+def test_the_perch_is_held_by_contact_in_the_plant_and_within_all_limits() -> None:
+    result, verdict = perch()
+    assert verdict.wrap_rad > 3.0
+    assert verdict.contact_force_n[0] > 1.0
+    assert max(max(s.truth.tension) for s in result.flight.samples) < CONFIG.limits.tension_max_n
+    assert not any(s.truth.body_contact for s in result.flight.samples if s.state.position_w[2] < -0.5)
+
+
+def test_the_anchored_vehicle_goes_where_it_is_pulled() -> None:
+    _, verdict = perch()
+    pull = {move.name: move for move in verdict.moves}
+    assert pull["pull x"].made_m == pytest.approx(0.010, abs=0.004)
+    assert verdict.hover_error_m < 0.005
+
+
+def test_the_predicted_wrench_is_the_plants() -> None:
+    _, verdict = perch()
+    error = {wrench.span: wrench for wrench in verdict.wrench}
+    assert error["free"].force_error_n < 0.15 * error["free"].true_force_n
+    assert error["perched"].force_error_n < error["perched"].true_force_n
+
+
+def test_no_cycle_is_missed_and_replay_gives_the_same_commands_bit_for_bit() -> None:
+    result, _ = perch()
+    assert result.missed == 0
+    count, different = replay(result.records[:6000], Parameters(CONFIG, RodModel(ArmParameters.of(CONFIG.arm))))
+    assert different is None, f"cycle {count}"
+    assert count == min(len(result.records), 6000)
+
+
+def test_the_record_keeps_every_field_of_every_cycle() -> None:
+    result, _ = perch()
+    assert all(len(dumps(record)) > 500 for record in result.records[::500])
+
+
+def test_a_bar_ten_centimetres_out_of_reach_is_reported_and_the_vehicle_comes_home() -> None:
+    def away(world: World) -> None:
+        x, y, z = CONFIG.sim.bar.position_m
+        world.plant.move_bar((x + 0.10, y, z))
+
+    result, verdict = fly(away)
+    assert not verdict.success
+    assert "no contact" in verdict.reason or "never perched" in verdict.reason
+    assert "PERCHED" not in phases(result)
+    assert phases(result)[-3:] == ["DEPART", "STOWING", "STOWED"]
+    assert "did not land" not in verdict.reason
+    assert not any(s.truth.body_contact for s in result.flight.samples if s.state.position_w[2] < -0.5)
+
+
+def test_the_pilot_takes_the_vehicle_while_it_is_perched_and_the_arm_holds() -> None:
+    def take(world: World) -> None:
+        world.at(60.0, lambda w: w.autopilot.take_over("POSCTL"))
+
+    result, verdict = fly(take)
+    assert not verdict.success
+    after = [r for r in result.records if r.state.phase.name == "HOLDING"]
+    assert after, phases(result)
+    assert all(r.commands.setpoint is None for r in after)
+    taken = next(
+        i for i, r in enumerate(result.records) if r.state.phase.name == "PERCHED" and r.facts.vehicle.mode == "POSCTL"
+    )
+    assert all(r.commands.setpoint is None for r in result.records[taken : taken + 300])
+
+
+def test_a_dead_servo_during_the_approach_ends_it_and_the_vehicle_comes_home() -> None:
+    def kill(world: World) -> None:
+        def silence(w: World) -> None:
+            w.servos[2].silenced = True
+
+        world.at(20.0, silence)
+
+    result, verdict = fly(kill)
+    assert not verdict.success
+    assert "tendon 2" in " ".join(text for _, text in result.flight.texts)
+    assert "PERCHED" not in phases(result)
+    assert "did not land" not in verdict.reason
+
+
+def test_the_same_seed_gives_the_same_flight_and_another_seed_another() -> None:
+    def short(seed: int) -> list[str]:
+        config = load("sim.toml", (f"sim.seed={seed}", "perch.contact_timeout_s=1.0"))
+        result = run_simulated(fly_simulated(config, lambda _: None))
+        return [dumps(dataclasses.replace(record)) for record in result.records[:3000]]
+
+    first = short(1)
+    assert first == short(1)
+    assert first != short(2)
