@@ -38,7 +38,7 @@ class RodModel:
     """
 
     def __init__(
-        self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 3e-4, fast: bool = False
+        self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 1e-4, fast: bool = False
     ) -> None:
         self._parameters = parameters
         self._tolerance, self._refuse = tolerance, refuse

@@ -41,6 +41,12 @@ class ArmTendonsConfig:
         lower=1.0,
         upper=1e12,
     )
+    guide_friction: float = option(
+        "Coulomb coefficient of the tendons in their guides; only the research commands use it, 0 is none",
+        0.0,
+        lower=0.0,
+        upper=2.0,
+    )
 
 
 @dataclass(frozen=True)

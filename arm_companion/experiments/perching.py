@@ -20,7 +20,7 @@ from arm_companion.geometry.arrays import ArrayLike
 BEND_DEG = 30.0
 TRAVEL = 0.01
 SPEED = 0.002
-STEP = 0.0005
+STEP = 0.00025
 AXES = {"x": 0, "z": 2}
 _STILL = 1e-3  # N, a change of tension that no guide holds back
 

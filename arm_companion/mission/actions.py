@@ -58,9 +58,9 @@ def prepare(s: Situation) -> State:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
             # from where the arm really is, so that torque coming on never jerks it
             bend = s.bend if _at_rest(s) else state.bend
-            return dataclasses.replace(state, bend=bend, bend_goal=(0.0, 0.0))
+            return dataclasses.replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
-            return dataclasses.replace(state, bend=s.bend, bend_goal=s.bend)
+            return dataclasses.replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
         case Phase.APPROACH:
             return dataclasses.replace(
                 state,
@@ -102,8 +102,11 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
         return state, ArmAction.HOLD, None
     speed = s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
-    pulls = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))
-    return dataclasses.replace(state, bend=bend), ArmAction.DRIVE, tuple(float(p) for p in pulls)
+    pulls = state.pulls
+    if bend != state.bend or not pulls:
+        goal = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))
+        pulls = tuple(float(pull) for pull in goal)
+    return dataclasses.replace(state, bend=bend, pulls=pulls), ArmAction.DRIVE, pulls
 
 
 def _pretension(s: Situation, theta: float) -> float:

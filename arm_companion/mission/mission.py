@@ -71,7 +71,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         actions.setpoint(situation),
         tuple(answers),
         tuple(notices),
-        status_report(situation, prediction.tip_a),
+        status_report(situation, prediction),
         prediction.wrench,
     )
     return state, commands

@@ -3,10 +3,10 @@
 import math
 
 from arm_companion.mission import actions
-from arm_companion.mission.facts import ArmFault, ArmFlag, Control, StatusReport, Vec3
+from arm_companion.mission.facts import ArmFault, ArmFlag, Control, StatusReport
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Phase
+from arm_companion.mission.state import Phase, Prediction
 
 _BEHAVIOUR = {
     Phase.STARTUP: "startup",
@@ -18,9 +18,9 @@ _BEHAVIOUR = {
 }
 
 
-def status_report(s: Situation, tip_a: Vec3) -> StatusReport:
+def status_report(s: Situation, prediction: Prediction) -> StatusReport:
     """ARM_STATUS of this cycle."""
-    theta, delta = _polar(s.bend)
+    theta, delta = _polar(prediction.bend)
     goal_theta, goal_delta = _polar(s.state.bend)
     return StatusReport(
         behaviour=_BEHAVIOUR.get(s.state.phase, "perch"),
@@ -31,7 +31,7 @@ def status_report(s: Situation, tip_a: Vec3) -> StatusReport:
         error_bits=s.state.errors | _present_faults(s),
         theta=theta,
         delta=delta,
-        tip_position_a=tip_a,
+        tip_position_a=prediction.tip_a,
         goal_theta=goal_theta,
         goal_delta=goal_delta,
     )
@@ -52,7 +52,7 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
         ArmFlag.ANCHORED: state.phase is Phase.PERCHED,
     }
-    return ArmFlag(sum(flag for flag, holds in held.items() if holds))
+    return ArmFlag(sum(flag.value for flag, holds in held.items() if holds))
 
 
 def _present_faults(s: Situation) -> ArmFault:
@@ -66,7 +66,7 @@ def _present_faults(s: Situation) -> ArmFault:
         ArmFault.SERVO_FAULT: any(tendon.error_bits for tendon in tendons),
         ArmFault.TENDON_OVER_TENSION: any(t.tension > s.config.limits.tension_max_n for t in tendons),
     }
-    return ArmFault(sum(fault for fault, present in there.items() if present))
+    return ArmFault(sum(fault.value for fault, present in there.items() if present))
 
 
 def _polar(u: tuple[float, float]) -> tuple[float, float]:

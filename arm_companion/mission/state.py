@@ -67,6 +67,7 @@ class Prediction:
     t: float  # loop time
     wrench: WrenchReport
     tip_a: Vec3  # m, base axes
+    bend: tuple[float, float]  # rad, that the measured displacements stand for
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
     # where the next solve starts; it follows from what was recorded before, so it is not recorded itself
     start: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
@@ -84,6 +85,7 @@ class State:
     streaming: bool = False  # set-points go out
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
+    pulls: tuple[float, ...] = ()  # m, tendon goals that belong to `bend`; empty: not found yet
     reference: Reference | None = None
     contact_w: Vec3 = ZERO  # m, vehicle reference when contact was found
     heading: float = 0.0  # rad, at which the vehicle faces the bar

@@ -44,7 +44,12 @@ def predict(s: Situation) -> Prediction:
     with suppress(ModelError):
         solution = anchored(s, s.state.position, start) if holding else s.free_arm
     return Prediction(
-        s.t, _wrench(s, solution, holding=holding), _tip(s), _lean(s, solution), solution if holding else None
+        s.t,
+        _wrench(s, solution, holding=holding),
+        _tip(s),
+        s.bend,
+        _lean(s, solution),
+        solution if holding else None,
     )
 
 

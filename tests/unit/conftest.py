@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from arm_companion.arm.arc_model import ArcModel
 from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import Config, load
 from arm_companion.mission.facts import Control, Facts, TendonState, VehicleState
 from arm_companion.mission.situation import Parameters
@@ -32,7 +32,7 @@ def config() -> Config:
 
 @pytest.fixture(scope="session")
 def parameters(config: Config) -> Parameters:
-    return Parameters(config, ArcModel(ArmParameters.of(config.arm)))
+    return Parameters(config, RodModel(ArmParameters.of(config.arm)))
 
 
 def tendons(pulls: tuple[float, ...], tensions: tuple[float, ...]) -> tuple[TendonState, ...]:

@@ -63,9 +63,7 @@ def test_settings_override_files_and_whole_numbers_pass_as_reals(tmp_path: Path)
         ('extends = "none.toml"\n', ["none.toml", "no such"]),
     ],
 )
-def test_what_does_not_fit_is_refused_with_all_that_helps(
-    tmp_path: Path, text: str, words: list[str]
-) -> None:
+def test_what_does_not_fit_is_refused_with_all_that_helps(tmp_path: Path, text: str, words: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
         load(write(tmp_path, text))
     for word in words:

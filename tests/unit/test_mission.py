@@ -19,17 +19,16 @@ from arm_companion.mission.facts import (
 )
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Anchor, Phase, Running, State
+from arm_companion.mission.wrench import grip
 from arm_companion.record_codec import dumps, loads
 
 DT = 0.01
 Hovering = Callable[..., Facts]
 
 
-def run(
-    state: State, facts: Facts, parameters: Parameters, seconds: float = DT
-) -> tuple[State, list[Commands]]:
+def run(state: State, facts: Facts, parameters: Parameters, seconds: float = DT) -> tuple[State, list[Commands]]:
     """Let `seconds` pass with the same facts; requests count once."""
     said = []
     t = state.t or 100.0
@@ -203,11 +202,26 @@ def test_a_perched_vehicle_is_moved_only_within_the_limit(parameters: Parameters
 
 
 def test_the_feedforward_leans_the_way_that_the_arm_pulls_back(parameters: Parameters, hovering: Hovering) -> None:
-    _, said = run(at(Phase.PERCHED, anchor=ANCHOR), ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 2.0)
+    bend = (4.9, 0.0)
+    facts = hovering(bend)
+    held = at(Phase.PERCHED, bend=bend, bend_goal=bend, position=(2.0, 0.0, -2.2), tension=(25.0, 9.0, 0.5, 9.0))
+    anchor = grip(Situation(held, facts, 100.0, parameters))
+    assert anchor.beyond, "the model finds the grip"
+    _, said = run(dataclasses.replace(held, anchor=anchor), ask(facts, Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 3.0)
     setpoint = said[-1].setpoint
     assert setpoint is not None
-    assert setpoint.acceleration_w[0] > 0.1
-    assert math.hypot(*setpoint.acceleration_w) <= parameters.config.limits.feedforward_m_per_s2 + 1e-9
+    north, east, down = setpoint.acceleration_w
+    assert 0.2 < north < parameters.config.limits.feedforward_m_per_s2
+    assert abs(east) < 0.1 * north
+    assert down == 0.0
+
+
+def test_without_a_model_of_the_grip_nothing_is_fed_forward_and_nothing_is_called_valid(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    _, said = run(at(Phase.PERCHED, anchor=ANCHOR), ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 2.0)
+    assert all(c.setpoint is not None and c.setpoint.acceleration_w == (0.0, 0.0, 0.0) for c in said)
+    assert not any(c.wrench.valid for c in said)
 
 
 def test_a_second_order_cancels_the_first_and_both_are_answered(parameters: Parameters, hovering: Hovering) -> None:
@@ -226,7 +240,10 @@ def test_memory_facts_and_commands_survive_their_text_form_bit_for_bit(
     parameters: Parameters, hovering: Hovering
 ) -> None:
     facts = ask(hovering((0.3, -0.2), position_age_s=math.inf), Order.JOG, 1.0, 0.1, 0.2)
-    state, (commands,) = run(at(Phase.PERCHED, anchor=ANCHOR, errors=ArmFault.SLIP | ArmFault.TIMEOUT), facts, parameters)
-    assert loads(State, dumps(state)) == state
+    state, (commands,) = run(
+        at(Phase.PERCHED, anchor=ANCHOR, errors=ArmFault.SLIP | ArmFault.TIMEOUT), facts, parameters
+    )
+    assert dumps(loads(State, dumps(state))) == dumps(state)
     assert loads(Facts, dumps(facts)) == facts
+    assert loads(State, dumps(state)).errors == state.errors == ArmFault.SLIP | ArmFault.TIMEOUT | ArmFault.VEHICLE_LOST
     assert dumps(loads(Commands, dumps(commands))) == dumps(commands)

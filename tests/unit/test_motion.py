@@ -38,17 +38,12 @@ def test_a_reference_arrives_without_breaking_a_bound(
     reference = Reference(start, ZERO, yaw)
     distance = norm(sub(goal, start))
     most = (
-        math.ceil(
-            (distance / speed + 2 * speed / acceleration + 2.0 * math.sqrt(distance / acceleration)) / DT
-        )
-        + 800
+        math.ceil((distance / speed + 2 * speed / acceleration + 2.0 * math.sqrt(distance / acceleration)) / DT) + 800
     )
     overshoot = 0.0
     for _ in range(most):
         before = reference
-        reference = follow(
-            reference, goal, goal_yaw, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=DT
-        )
+        reference = follow(reference, goal, goal_yaw, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=DT)
         assert norm(reference.velocity) <= speed + 1e-9
         assert norm(sub(reference.velocity, before.velocity)) <= acceleration * DT * (1 + 1e-9) + 1e-12
         assert abs(wrap_angle(reference.yaw - before.yaw)) <= 1.0 * DT + 1e-9

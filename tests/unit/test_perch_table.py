@@ -62,7 +62,11 @@ def test_a_gripping_arm_never_stows_or_departs_without_letting_go_first(phase: P
 
 def test_abort_rows_come_before_progress() -> None:
     first_progress = next(i for i, row in enumerate(TABLE.transitions) if not row.fails)
-    late = [row for row in TABLE.transitions[first_progress:] if row.error in (ArmFault.PILOT_TOOK_OVER, ArmFault.SERVO_FAULT)]
+    late = [
+        row
+        for row in TABLE.transitions[first_progress:]
+        if row.error in (ArmFault.PILOT_TOOK_OVER, ArmFault.SERVO_FAULT)
+    ]
     assert late == []
 
 
@@ -90,4 +94,6 @@ def test_phase_numbers_are_those_of_the_dialect() -> None:
 
 def test_the_committed_diagram_is_the_table() -> None:
     page = Path(__file__).parents[2] / "docs" / "perch_states.md"
-    assert page.read_text(encoding="utf-8") == document(), "python -m arm_companion.mission.diagram > docs/perch_states.md"
+    assert page.read_text(encoding="utf-8") == document(), (
+        "python -m arm_companion.mission.diagram > docs/perch_states.md"
+    )
