@@ -260,17 +260,12 @@ class RodModel:
     def _unloaded(self, rod: Rod, goal: Problem) -> Array:
         """Bends (2 m,) of the pieces without load, rad."""
         part = self._parameters.up_to(rod.s)
-        locked = bool(goal.stiffness[0] > 0)
-        if locked:
-            u = statics.bend_for_pull(part, goal.pull - self._slack)
-            tension = statics.stretch_tension(part, u, goal.pull - self._slack)
-        else:
-            u, tension = np.zeros(part.H.shape[1]), goal.pull
-        # What the chords between the disks leave of the stiffness.
-        stiffness = part.bending - 2 * tension @ part.chord_loss
+        if goal.stiffness[0] > 0:
+            return statics.bend_for_pull(part, goal.pull - self._slack)
+        stiffness = part.bending - 2 * goal.pull @ part.chord_loss
         if stiffness.min() <= 0:
-            raise LimitViolated("sum of tensions", float(tension.sum()), 0.0, _buckling_tension(part))
-        return u if locked else np.asarray(tension @ part.H / stiffness)
+            raise LimitViolated("sum of tensions", float(goal.pull.sum()), 0.0, statics.buckling_tension(part))
+        return np.asarray(goal.pull @ part.H / stiffness)
 
 
 def _at(rod: Rod, problem: Problem, c: Array, wrench: Array) -> Solved:
@@ -284,11 +279,6 @@ def _support(hold: Hold) -> Support:
     if hold.kind is HoldKind.PINNED:
         return Support(hold.pivot, point)
     return Support(hold.pivot, point, hold.pose.rotation, hold.axis)
-
-
-def _buckling_tension(part: ArmParameters) -> float:
-    """Sum of tensions, N, at which chords between the disks take all stiffness: 12 EI / l_d^2."""
-    return min(12 * g.EI * (g.disks / g.L) ** 2 for g in part.segments)
 
 
 def _norm(v: Array) -> float:

@@ -8,7 +8,7 @@ theta sin delta). The paper's statics (eq. 11) in these coordinates: H^T tau + J
 import numpy as np
 
 from arm_companion.arm.parameters import ArmParameters
-from arm_companion.errors import NoSolution
+from arm_companion.errors import LimitViolated, NoSolution
 from arm_companion.geometry.arrays import Array, ArrayLike
 
 _ITERATIONS = 60
@@ -73,6 +73,7 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
     in every step.
 
     Raises:
+        LimitViolated: when chords between the disks take all stiffness: the backbone buckles between them.
         NoSolution: when no minimum is found.
     """
     q = np.asarray(pull, dtype=np.float64)
@@ -84,10 +85,25 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
         tau = stretch_tension(parameters, u, q)
         g = bending_moment(parameters, u, tau)
         residual = float(np.abs(g).max()) / scale
-        if residual < _TOLERANCE * (1 + float(tau.max(initial=0.0)) * parameters.r / scale):
-            return np.asarray(u)
+        if residual < _tolerance(parameters, tau):
+            break
         u = u - _descent(parameters, u, tau, H + 2 * c * u, k * (tau > 0), g, q)
-    raise NoSolution(residual, "unloaded bend")
+    tau = stretch_tension(parameters, u, q)
+    if (parameters.bending - 2 * tau @ c).min() <= 0:
+        raise LimitViolated("sum of tensions", float(tau.sum()), 0.0, buckling_tension(parameters))
+    if residual >= _tolerance(parameters, tau):
+        raise NoSolution(residual, "unloaded bend")
+    return np.asarray(u)
+
+
+def buckling_tension(parameters: ArmParameters) -> float:
+    """Sum of tensions, N, at which chords between the disks take all stiffness of a segment: 12 EI / l_d^2."""
+    return min(12 * g.EI * (g.disks / g.L) ** 2 for g in parameters.segments)
+
+
+def _tolerance(parameters: ArmParameters, tau: Array) -> float:
+    """Of the moment left over, relative to EI / L: what double precision leaves of tensions of this size."""
+    return _TOLERANCE * (1 + float(tau.max(initial=0.0)) * parameters.r / float(parameters.bending.max()))
 
 
 def _descent(parameters: ArmParameters, u: Array, tau: Array, path: Array, k: Array, g: Array, q: Array) -> Array:
@@ -95,8 +111,9 @@ def _descent(parameters: ArmParameters, u: Array, tau: Array, path: Array, k: Ar
     K = path.T @ (k[:, None] * path) + np.diag(parameters.bending - 2 * tau @ parameters.chord_loss)
     step = np.linalg.solve(K, g)
     start = _energy(parameters, u, q)
+    rounding = 1e-12 * abs(start)  # below it the energy cannot tell better from worse
     for _ in range(30):
-        if _energy(parameters, u - step, q) <= start - 1e-4 * float(step @ g) + 1e-15 * abs(start):
+        if _energy(parameters, u - step, q) <= start - 1e-4 * float(step @ g) + rounding:
             break
         step = 0.5 * step
     return np.asarray(step)

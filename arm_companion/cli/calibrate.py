@@ -83,6 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
     except UnicodeDecodeError:
         print(f"arm-companion calibrate: {arguments.data}: not UTF-8 text", file=sys.stderr)
     except OSError as error:
+        if error.filename is None:  # not a file of ours, such as a closed pipe
+            raise
         print(f"arm-companion calibrate: {error.filename}: {error.strerror}", file=sys.stderr)
     return 2
 

@@ -161,6 +161,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"arm-companion model {arguments.action}: {error}", file=sys.stderr)
         return 2
     except OSError as error:
+        if error.filename is None:  # not a file of ours, such as a closed pipe
+            raise
         print(f"arm-companion model {arguments.action}: {error.filename}: {error.strerror}", file=sys.stderr)
         return 1
 
@@ -179,9 +181,9 @@ def _check(arguments: argparse.Namespace) -> None:
         raise _RefusedError("--figure needs 'matplotlib': pip install 'arm-companion[sim]'")
 
 
-def _pull(arguments: argparse.Namespace, parameters: ArmParameters, model: RodModel) -> Array:
+def _pull(arguments: argparse.Namespace, parameters: ArmParameters) -> Array:
     if arguments.pull_m is None:
-        return model.pull_for_bend(case.bend(arguments.theta_deg or 0.0, arguments.delta_deg or 0.0))
+        return case.goals(parameters, arguments.theta_deg or 0.0, arguments.delta_deg or 0.0)
     if arguments.theta_deg is not None or arguments.delta_deg is not None:
         raise _RefusedError("give a bend or --pull-m, not both")
     if len(arguments.pull_m) != parameters.n:
@@ -193,7 +195,7 @@ def _case(arguments: argparse.Namespace, config: Config, parameters: ArmParamete
     model = RodModel(parameters)
     held = arguments.action == "clamp"
     payload = None if held or arguments.payload_kg == 0 else Payload(arguments.payload_kg)
-    asked = case.Case(model, _pull(arguments, parameters, model), gravity, payload)
+    asked = case.Case(model, _pull(arguments, parameters), gravity, payload)
     begun = time.perf_counter()
     if held:
         move = [1e-3 * value for value in arguments.base_move_mm]

@@ -220,7 +220,11 @@ class PerchConfig:
     )
     bend_speed_rad_per_s: float = option("bending and unbending", 0.9, unit="rad/s", lower=0.01, upper=10.0)
     grip_tension_n: float = option(
-        "tension of the tightest tendon that means gripped; a free arm at the full wrap has less", 21.5, unit="N", lower=1.0, upper=200.0
+        "tension of the tightest tendon that means gripped; a free arm at the full wrap has less",
+        21.5,
+        unit="N",
+        lower=1.0,
+        upper=200.0,
     )
     verify_pull_m: float = option("set-point offset of the pull test", 0.05, unit="m", lower=0.005, upper=0.5)
     verify_give_share: float = option(
@@ -297,6 +301,11 @@ class Config:
         if len(self.servos.ids) != len(self.arm.tendons.angles_deg):
             raise ConfigError(
                 f"servos.ids has {len(self.servos.ids)} entries for {len(self.arm.tendons.angles_deg)} tendons"
+            )
+        if self.perch.wrap_bend_rad > self.limits.bend_max_rad:
+            raise ConfigError(
+                f"perch.wrap_bend_rad = {self.perch.wrap_bend_rad:g} is over limits.bend_max_rad = "
+                f"{self.limits.bend_max_rad:g}"
             )
         if sum(link.role == "autopilot" for link in self.links.values()) > 1:
             raise ConfigError("links: more than one link has the role autopilot")

@@ -37,6 +37,16 @@ def bend(theta_deg: float, delta_deg: float = 0.0) -> Array:
     return np.array((theta * math.cos(delta), theta * math.sin(delta)))
 
 
+def goals(parameters: ArmParameters, theta_deg: float, delta_deg: float = 0.0) -> Array:
+    """Tendon goals (n,), m, for an unloaded, gravity-free bend; they make up for the tendons' own stretch.
+
+    The same goals whatever the guides, so that two kinds of guides are compared under one command: with real disks
+    the chords take in a little more, and the bend comes out larger, by 0.07 deg in 60 for the reference arm. Where a
+    tendon would have to push it goes slack, and the bend comes out smaller.
+    """
+    return statics.pull_for_bend(replace(parameters, guides=Guides.CONTINUOUS), bend(theta_deg, delta_deg))
+
+
 def field(config: Config, *, on: bool, attitude_deg: Sequence[float] | None = None) -> Array:
     """Gravity (3,), m/s^2, base axes.
 

@@ -14,7 +14,7 @@ from arm_companion.arm.model import ArmSolution, HoldKind
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import ModelError
-from arm_companion.experiments.case import Case, bend
+from arm_companion.experiments.case import Case, goals
 from arm_companion.geometry.arrays import ArrayLike
 
 BEND_DEG = 30.0
@@ -117,7 +117,7 @@ def run(
         ModelError: when not even the arm at rest has a solution.
     """
     model = RodModel(parameters)
-    case = Case(model, model.pull_for_bend(bend(bend_deg)), np.asarray(gravity, dtype=np.float64))
+    case = Case(model, goals(parameters, bend_deg), np.asarray(gravity, dtype=np.float64))
     unloaded = case.free()
     return [_travel(case, unloaded, axis, distance, kind, speed, step) for axis, distance in travels]
 

@@ -19,7 +19,7 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.arm.stiffness import stiffness_along
 from arm_companion.errors import ModelError
-from arm_companion.experiments.case import GRAVITY, bend
+from arm_companion.experiments.case import GRAVITY, goals
 from arm_companion.geometry.arrays import Array, ArrayLike
 
 BENDS_DEG = (0.0, 15.0, 30.0, 45.0, 60.0)
@@ -157,7 +157,7 @@ class _PulleyModel(RodModel):
 def _curve(
     model: RodModel, bend_deg: float, inward: bool, gravity: Array, mu: float, schedule: list[tuple[int, bool, float]]
 ) -> Curve:
-    pull = model.pull_for_bend(bend(bend_deg))
+    pull = goals(model.parameters, bend_deg)
     readings: list[Reading] = []
     initial = math.nan
     try:

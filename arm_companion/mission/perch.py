@@ -40,12 +40,11 @@ _BAR_LEVEL = 0.2  # sine of the steepest bar that an upright vehicle can wrap
 
 def pilot_takes_over(s: Situation) -> str | None:
     """The autopilot left our mode: whoever did it, the vehicle is theirs."""
-    return f"the pilot has the vehicle (mode {s.facts.vehicle.mode})" if not s.external else None
-
-
-def failsafe(s: Situation) -> str | None:
-    """The autopilot declares an emergency."""
-    return "autopilot failsafe" if s.facts.vehicle.control is Control.FAILSAFE else None
+    if s.external:
+        return None
+    if s.facts.vehicle.control is Control.FAILSAFE:
+        return f"autopilot failsafe (mode {s.facts.vehicle.mode})"
+    return f"the pilot has the vehicle (mode {s.facts.vehicle.mode})"
 
 
 def disarmed(s: Situation) -> str | None:
@@ -114,6 +113,19 @@ def overstressed(s: Situation) -> str | None:
     """A tendon carries more than its limit."""
     most, limit = max(s.tensions), s.config.limits.tension_max_n
     return f"tendon tension {most:.1f} N is over {limit:g} N" if most > limit else None
+
+
+def wrench_over_limit(s: Situation) -> str | None:
+    """The arm is predicted to push or twist the airframe harder than it may."""
+    prediction, limits = s.state.prediction, s.config.limits
+    if prediction is None or not prediction.wrench.valid:
+        return None
+    force, torque = norm(prediction.wrench.force_b), norm(prediction.wrench.torque_b)
+    if force > limits.wrench_force_n:
+        return f"{force:.1f} N on the airframe is over {limits.wrench_force_n:g} N"
+    if torque > limits.wrench_moment_nm:
+        return f"{torque:.2f} N m on the airframe is over {limits.wrench_moment_nm:g} N m"
+    return None
 
 
 # --- guards: what goes well ---
@@ -302,6 +314,8 @@ TABLE: Table[Phase, Situation] = Table(
         Row(FREE_FLIGHT | {Phase.DEPART}, vehicle_lost, Phase.STOWING, "vehicle lost", ArmFault.VEHICLE_LOST),
         Row(GRASPING, vehicle_lost, Phase.RELEASE, "vehicle lost", ArmFault.VEHICLE_LOST),
         Row(GRIPPED, vehicle_lost, Phase.HOLDING, "vehicle lost", ArmFault.VEHICLE_LOST),
+        Row(FREE_FLIGHT | {Phase.DEPART}, disarmed, Phase.STOWING, "disarmed", ArmFault.DISARMED),
+        Row(GRASPING | GRIPPED, disarmed, Phase.HOLDING, "disarmed", ArmFault.DISARMED),
         Row(FREE_FLIGHT, servo_fault, Phase.DEPART, "servo fault", ArmFault.SERVO_FAULT),
         Row(GRASPING | {Phase.VERIFY}, servo_fault, Phase.UNLOAD, "servo fault", ArmFault.SERVO_FAULT),
         Row(
@@ -312,6 +326,7 @@ TABLE: Table[Phase, Situation] = Table(
             ArmFault.SERVO_FAULT,
         ),
         Row(GRASPING | GRIPPED, overstressed, Phase.UNLOAD, "over-tension", ArmFault.TENDON_OVER_TENSION),
+        Row(GRIPPED, wrench_over_limit, Phase.UNLOAD, "wrench limit", ArmFault.WRENCH_LIMIT),
         Row(frozenset({Phase.PERCHED}), grip_lost, Phase.UNLOAD, "grip lost", ArmFault.SLIP),
         Row(
             frozenset({Phase.READYING}),

@@ -1,6 +1,7 @@
 """One picture of a flight: where it went, what the tendons did, what the arm put on the airframe."""
 
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -18,7 +19,7 @@ _PERCHED = "#fef3c7"
 
 def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
     """Write the figure as PNG."""
-    style = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": _INK}
+    style: Any = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": _INK}
     with mpl.rc_context(style):
         figure = Figure(figsize=(11, 9.5), layout="constrained")
         axes = figure.subplots(5, 1, sharex=True, height_ratios=[1.3, 1.2, 1.0, 1.3, 1.3])

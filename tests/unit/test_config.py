@@ -55,6 +55,7 @@ def test_settings_override_files_and_whole_numbers_pass_as_reals(tmp_path: Path)
             "[servos]\nids = [1, 2, 3]\ndirections = [1, 1, 1]\nzero_ticks = [0, 0, 0]\n",
             ["servos.ids", "4 tendons"],
         ),
+        ("[perch]\nwrap_bend_rad = 6.0\n", ["perch.wrap_bend_rad", "limits.bend_max_rad"]),
         ("[links.a]\nrole = 'ground'\n", ["links.a.url", "missing"]),
         ("[links]\na = 3\n", ["links.a", "a table"]),
         ("arm = 3\n", ["arm", "a table"]),

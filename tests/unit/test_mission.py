@@ -16,11 +16,13 @@ from arm_companion.mission.facts import (
     Order,
     Request,
     Result,
+    WrenchReport,
+    WrenchSource,
 )
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Anchor, Phase, Running, State
+from arm_companion.mission.state import Anchor, Phase, Prediction, Running, State
 from arm_companion.mission.wrench import grip
 from arm_companion.record_codec import dumps, loads
 
@@ -247,3 +249,20 @@ def test_memory_facts_and_commands_survive_their_text_form_bit_for_bit(
     assert loads(Facts, dumps(facts)) == facts
     assert loads(State, dumps(state)).errors == state.errors == ArmFault.SLIP | ArmFault.TIMEOUT | ArmFault.VEHICLE_LOST
     assert dumps(loads(Commands, dumps(commands))) == dumps(commands)
+
+
+def test_a_disarmed_vehicle_ends_the_approach_and_never_opens_a_grip(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    for phase, after in ((Phase.APPROACH, Phase.STOWING), (Phase.WRAP, Phase.HOLDING), (Phase.PERCHED, Phase.HOLDING)):
+        state, _ = run(at(phase, anchor=ANCHOR), hovering(armed=False), parameters)
+        assert state.phase is after
+        assert state.errors & ArmFault.DISARMED
+
+
+def test_a_wrench_over_its_limit_unloads_the_grip(parameters: Parameters, hovering: Hovering) -> None:
+    wrench = WrenchReport((13.0, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1), WrenchSource.ANCHORED, True, 1.0, 0.0)
+    prediction = Prediction(100.0, wrench, (0, 0, 0.25), (0, 0), (0, 0, 0))
+    state, said = run(at(Phase.PERCHED, anchor=ANCHOR, prediction=prediction), hovering(), parameters)
+    assert state.phase is Phase.UNLOAD
+    assert any("13.0 N" in notice.text for c in said for notice in c.notices)
