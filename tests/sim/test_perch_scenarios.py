@@ -105,6 +105,7 @@ def test_a_bar_ten_centimetres_out_of_reach_is_reported_and_the_vehicle_comes_ho
     assert not any(s.truth.body_contact for s in result.flight.samples if s.state.position_w[2] < -0.5)
 
 
+@pytest.mark.scenario
 def test_the_pilot_takes_the_vehicle_while_it_is_perched_and_the_arm_holds() -> None:
     def take(world: World) -> None:
         world.at(60.0, lambda w: w.autopilot.take_over("POSCTL"))
@@ -120,6 +121,7 @@ def test_the_pilot_takes_the_vehicle_while_it_is_perched_and_the_arm_holds() -> 
     assert all(r.commands.setpoint is None for r in result.records[taken : taken + 300])
 
 
+@pytest.mark.scenario
 def test_a_dead_servo_during_the_approach_ends_it_and_the_vehicle_comes_home() -> None:
     def kill(world: World) -> None:
         def silence(w: World) -> None:
@@ -134,6 +136,7 @@ def test_a_dead_servo_during_the_approach_ends_it_and_the_vehicle_comes_home() -
     assert "did not land" not in verdict.reason
 
 
+@pytest.mark.scenario
 def test_the_same_seed_gives_the_same_flight_and_another_seed_another() -> None:
     def short(seed: int) -> list[str]:
         def end_soon(world: World) -> None:
