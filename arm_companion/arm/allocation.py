@@ -54,29 +54,43 @@ def hold_moment(H: Array, b: Array, preferred: Array, tension_min: float, tensio
     """The tensions (n,) nearest to `preferred` inside the limits with H^T tau = b; None when there are none.
 
     The dual of that small quadratic programme has only as many unknowns y as b has entries, and tau =
-    clip(preferred + H y): a semismooth Newton on a convex function with a kink at every limit.
+    clip(preferred + H y): Newton on a convex function with a kink at every limit, each step as long as is best.
     """
     arm = float(np.abs(H).max())
     scale = arm * max(1.0, tension_min, float(np.abs(preferred).max())) + float(np.abs(b).max())
-    y = np.zeros(H.shape[1])
+    free = np.array(preferred)
     for _ in range(_ITERATIONS):
-        free = preferred + H @ y
         tau = np.clip(free, tension_min, tension_max)
         g = H.T @ tau - b
         if float(np.abs(g).max()) < _FEASIBLE * scale:
             return np.asarray(tau)
         inside = (free >= tension_min) & (free <= tension_max)
-        step = np.linalg.solve(H[inside].T @ H[inside] + 1e-9 * (H.T @ H), g)
-        start, slope = _dual(free, tau, b, y), float(step @ g)
-        for _ in range(50):
-            trial = y - step
-            free = preferred + H @ trial
-            if _dual(free, np.clip(free, tension_min, tension_max), b, trial) <= start - 1e-4 * slope:
-                break
-            step, slope = 0.5 * step, 0.5 * slope
-        y = y - step
+        step = -np.linalg.solve(H[inside].T @ H[inside] + 1e-6 * (H.T @ H), g)
+        along = H @ step
+        length = _best_step(free, along, float(g @ step), tension_min, tension_max)
+        if length is None:
+            return None
+        free = free + length * along
     return None
 
 
-def _dual(free: Array, tau: Array, b: Array, y: Array) -> float:
-    return float((tau * free - 0.5 * tau * tau).sum() - b @ y)
+def _best_step(free: Array, along: Array, slope: float, tension_min: float, tension_max: float) -> float | None:
+    """Where the dual function, which starts with `slope` < 0, is lowest along a direction; None when it falls for ever.
+
+    Its derivative is piecewise linear and grows: it is followed from kink to kink until it reaches zero.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kinks = np.concatenate(((tension_min - free) / along, (tension_max - free) / along))
+    kinks = np.sort(kinks[np.isfinite(kinks) & (kinks > 0)])
+    at = 0.0
+    for end in (*kinks, np.inf):
+        middle = free + (0.5 * (at + end) if np.isfinite(end) else 2 * at + 1.0) * along
+        moving = (middle > tension_min) & (middle < tension_max)
+        growth = float(along[moving] @ along[moving])
+        if growth > 0 and slope + growth * (end - at) >= 0:
+            return at - slope / growth
+        if not np.isfinite(end):
+            return None
+        slope += growth * (end - at)
+        at = float(end)
+    return None

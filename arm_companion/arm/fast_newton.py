@@ -1,4 +1,8 @@
-"""Newton's method for a rod, compiled by numba: what `rod_solver.newton` does, with its checks, in one call."""
+"""Newton's method for a rod, compiled by numba: what `rod_solver.newton` does, with its checks, in one call.
+
+Numba's cache on disk looks at the file that a function stands in and not at those it calls: after a change in
+`fast_equations` this file must be saved anew as well (an installation writes both; the tests notice).
+"""
 
 import math
 from typing import Any

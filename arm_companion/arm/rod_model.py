@@ -11,7 +11,7 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
 from arm_companion.arm.rod_equations import Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
-from arm_companion.errors import LimitViolated, NoSolution
+from arm_companion.errors import ConfigError, LimitViolated, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
@@ -69,7 +69,13 @@ class RodModel:
         return statics.bend_for_pull(self._parameters, pull)
 
     def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
-        """See `ArmModel.bend_for_tip`; an unloaded segment is an arc."""
+        """See `ArmModel.bend_for_tip`; an unloaded segment is an arc.
+
+        Raises:
+            ConfigError: for several segments, which reach most points in many ways.
+        """
+        if len(self._parameters.segments) != 1:
+            raise ConfigError("the bend for a tip position is defined for one segment")
         L = self._parameters.L
         return arc.bend_for_tip(p_tip_base, L, 0.01 * L if tolerance is None else tolerance)
 

@@ -216,7 +216,7 @@ class PerchConfig:
         upper=3.0,
     )
     wrap_clearance_m: float = option(
-        "how far the vehicle stays clear of the bar when the wrap begins", 0.03, unit="m", lower=0.0, upper=0.3
+        "how far the vehicle stays clear of the bar when the wrap begins", 0.08, unit="m", lower=0.0, upper=0.3
     )
     bend_speed_rad_per_s: float = option("bending and unbending", 0.9, unit="rad/s", lower=0.01, upper=10.0)
     grip_tension_n: float = option(

@@ -48,6 +48,7 @@ _ACCELERATION = 0.6
 _YAW_RATE = 0.6
 _NEAR_M = 0.15  # from here on the bar may be touched at any moment
 _FAR_FACTOR = 3.0
+_FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _LEAN_RATE = 1.0  # m/s^3
 
 
@@ -195,8 +196,9 @@ def _beside_bar(s: Situation) -> Vec3:
     closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
         closed = state.anchor.position_w
-    clear = _clear_of_bar(s)
-    return add(clear, scale(sub(closed, clear), share))
+    # forward first, while the curl is still wide
+    ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / _FORWARD_SHARE, 0.0))
+    return add(add(s.state.contact_w, scale(sub(closed, s.state.contact_w), share)), ahead)
 
 
 def _clear_of_bar(s: Situation) -> Vec3:

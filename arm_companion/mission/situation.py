@@ -114,6 +114,8 @@ class Situation:
                 return f"tendon {i + 1}: servo hardware error 0x{tendon.error_bits:02x}"
             if tendon.silent:
                 return f"tendon {i + 1}: servo does not answer"
+            if tendon.torque and not tendon.ready:
+                return f"tendon {i + 1}: servo does not follow goals"
         return None
 
     @cached_property

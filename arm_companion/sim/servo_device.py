@@ -46,6 +46,7 @@ class EmulatedServo:
     Attributes:
         values: raw value of every register, by address.
         motor: the horn's true motion, which no loss of power changes.
+        lag_s: by how much its time, as `advance` counts it, is behind the world's clock; its own clock is not.
         silenced: its transmitter is broken: it obeys and does not answer.
     """
 
@@ -53,6 +54,7 @@ class EmulatedServo:
         self.values = {address: register.initial for address, register in ct.REGISTERS.items()}
         self.motor = Motor(position)
         self.silenced = False
+        self.lag_s = 0.0
         self._rng = rng
         self._trajectory = Trajectory(position)
         self._turns = 0.0  # ticks from the horn's true position to the reported one
@@ -314,7 +316,7 @@ class EmulatedServo:
         """Bring the measured registers up to date."""
         v = self.values
         position = self.motor.position + self._turns
-        v[ct.REALTIME_TICK.address] = int((self._clock - self._booted_at) * 1000) % ct.TICK_CLOCK_MODULUS_MS
+        v[ct.REALTIME_TICK.address] = self._tick()
         v[ct.PRESENT_POSITION.address] = round(position)
         v[ct.PRESENT_VELOCITY.address] = round(self.motor.speed * ct.TICK_RAD / ct.VELOCITY_UNIT_RAD_PER_S)
         v[ct.PRESENT_PWM.address] = round(self.motor.duty * ct.PWM_FULL)
@@ -326,6 +328,9 @@ class EmulatedServo:
         v[ct.POSITION_TRAJECTORY.address] = round(self._trajectory.position)
         v[ct.MOVING.address] = int(self._moving())
         v[ct.MOVING_STATUS.address] = self._moving_status(position)
+
+    def _tick(self) -> int:
+        return int((self._clock + self.lag_s - self._booted_at) * 1000) % ct.TICK_CLOCK_MODULUS_MS
 
     def _moving(self) -> bool:
         threshold = self.values[ct.MOVING_THRESHOLD.address] * ct.VELOCITY_UNIT_RAD_PER_S

@@ -19,7 +19,7 @@ from arm_companion.sim.servo_emulator import ServoEmulator
 _CONTROL_PERIOD_S = 0.002
 _SAMPLE_EVERY = 10  # control periods
 _MOST_BEHIND_S = 0.1
-_PERIODS_IN_ONE_GO = 3
+_PERIODS_IN_ONE_GO = 2
 _TICKS_PER_RAD = 4096 / (2.0 * math.pi)
 
 
@@ -55,19 +55,18 @@ class World:
         start = loop.time()
         periods = 0
         async for tick in ticks(_CONTROL_PERIOD_S):
-            due = math.floor((tick.now - start) / _CONTROL_PERIOD_S + 0.5) + 1 - periods
-            most = round(_MOST_BEHIND_S / _CONTROL_PERIOD_S)
-            if due > most:  # the machine stalled: time is lost rather than caught up in a burst
-                self.lost_s += (due - most) * _CONTROL_PERIOD_S
-                start += (due - most) * _CONTROL_PERIOD_S
-                due = most
-            for i in range(due):
-                if i % _PERIODS_IN_ONE_GO == _PERIODS_IN_ONE_GO - 1:
-                    await asyncio.sleep(0)  # who is late still answers the servo bus in between
+            lag = tick.now - start - self.lost_s - periods * _CONTROL_PERIOD_S
+            if lag > _MOST_BEHIND_S:  # the machine stalled: this time is lost
+                self.lost_s += lag - _MOST_BEHIND_S
+                lag = _MOST_BEHIND_S
+            # who is late catches up in small steps, and answers the servo bus in between
+            for _ in range(min(math.floor(lag / _CONTROL_PERIOD_S + 0.5) + 1, _PERIODS_IN_ONE_GO)):
                 self._advance()
                 periods += 1
                 if periods % _SAMPLE_EVERY == 0:
                     self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth()))
+            for servo in self.servos.servos:
+                servo.lag_s = loop.time() - start - periods * _CONTROL_PERIOD_S
 
     def _advance(self) -> None:
         """One control period."""

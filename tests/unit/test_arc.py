@@ -238,3 +238,22 @@ def test_part_of_an_arm_keeps_line_mass_and_disk_spacing():
     assert part.segments[0].L / part.segments[0].disks == pytest.approx(L / 10)
     assert part.mass == pytest.approx(0.1 * P.segments[0].line_mass)
     assert P.up_to(0.3) is P
+
+
+@given(st.integers(3, 8), st.integers(0, 10_000), st.sampled_from([0.0, 0.5, 2.0]), st.sampled_from([20.0, 60.0]))
+def test_allocation_refuses_only_what_cannot_be(count, seed, least, most):
+    """Against a linear programme that only asks whether there are tensions at all."""
+    from scipy.optimize import linprog
+
+    rng = np.random.default_rng(seed)
+    H = rng.uniform(0.005, 0.03) * np.column_stack(
+        [f(2 * math.pi * (np.arange(count) + rng.uniform(-0.15, 0.15, count)) / count) for f in (np.cos, np.sin)]
+    )
+    b = rng.normal(size=2) * rng.choice((0.0, 1e-6, 0.1, 1.0))
+    tau = allocation.hold_moment(H, b, np.full(count, max(least, 4.0)), least, most)
+    possible = linprog(np.ones(count), A_eq=H.T, b_eq=b, bounds=[(least, most)] * count).status == 0
+    assert (tau is not None) == possible
+    if tau is not None:
+        assert np.allclose(H.T @ tau, b, atol=1e-7)
+        assert tau.min() >= least
+        assert tau.max() <= most

@@ -13,7 +13,7 @@ from arm_companion.arm.model import Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides, Segment, Tendon
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import ArmConfig
-from arm_companion.errors import LimitViolated, ModelError, NoSolution
+from arm_companion.errors import ConfigError, LimitViolated, ModelError, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.se3 import Pose
 from tests.unit.shooting import shoot
@@ -109,6 +109,8 @@ def test_two_segments_make_the_papers_s():
     middle, tip = solution.section(0.15), solution.section(0.27)
     assert np.allclose(tip.position, solution.tip_position, atol=1e-9)
     assert middle.rotation[0, 2] > 0.3 > solution.tip_rotation[0, 2]
+    with pytest.raises(ConfigError, match="one segment"):
+        model.bend_for_tip(solution.tip_position)
 
 
 @pytest.mark.parametrize("s", [0.27, 0.2, 0.12])
