@@ -2,6 +2,7 @@
 
 import argparse
 import importlib
+import os
 import sys
 
 from arm_companion import __version__
@@ -34,6 +35,10 @@ def main(argv: list[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     try:
         code: int = arguments.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever read our output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
     except ConfigError as error:
         print(f"arm-companion: {error}", file=sys.stderr)
         return error.exit_code

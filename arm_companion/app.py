@@ -21,9 +21,8 @@ from arm_companion.drivers.tendons import Tendons
 from arm_companion.errors import ConfigError, DeviceFault
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
-from arm_companion.mission.perch import FLYING
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import State
+from arm_companion.mission.state import MOVES_VEHICLE, State
 from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
@@ -185,7 +184,7 @@ class Daemon:
         for notice in commands.notices:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
-        self._component.active = self._state.phase in FLYING
+        self._component.active = self._state.phase in MOVES_VEHICLE
         self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls)
 
     async def _fall_back(self, tick: Tick) -> None:

@@ -124,7 +124,7 @@ def setpoint(s: Situation) -> Setpoint | None:
     accepts the switch only then.
     """
     reference = s.state.reference
-    if not s.state.streaming or reference is None or not s.facts.vehicle.armed:
+    if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
     return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw)
 
@@ -151,7 +151,7 @@ def _reference(s: Situation) -> Reference | None:
     state = s.state
     if not state.streaming or not s.vehicle_fresh:
         return state.reference  # frozen: acting on old state is worse than waiting
-    if not s.external:
+    if not (s.external and s.wants_stream):
         return _here(s)
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:

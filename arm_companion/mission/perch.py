@@ -16,7 +16,7 @@ FREE_FLIGHT = frozenset({Phase.APPROACH, Phase.REACH})
 GRASPING = frozenset({Phase.CONTACT, Phase.WRAP})
 GRIPPED = frozenset({Phase.VERIFY, Phase.PERCHED})
 LEAVING = frozenset({Phase.UNLOAD, Phase.RELEASE, Phase.DEPART})
-FLYING = FREE_FLIGHT | GRASPING | GRIPPED | LEAVING
+
 TENSE = GRASPING | GRIPPED | frozenset({Phase.UNLOAD, Phase.HOLDING})
 """Phases in which the arm may be carrying a load."""
 

@@ -15,7 +15,7 @@ from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Vec3
 from arm_companion.mission.motion import dot, norm, scale, sub, turn_by_yaw, unrotate
-from arm_companion.mission.state import State
+from arm_companion.mission.state import MOVES_VEHICLE, State
 
 _FROM_FACTS = frozenset({"gravity_a", "mount", "bend", "free_arm"})
 
@@ -76,6 +76,15 @@ class Situation:
     def external(self) -> bool:
         """Whether our set-points fly the vehicle."""
         return self.facts.vehicle.control is Control.EXTERNAL
+
+    @property
+    def wants_stream(self) -> bool:
+        """Whether set-points go out in this phase.
+
+        PX4 accepts the switch to external control only with a stream, and leaves it without one. ArduPilot needs
+        none, holds by itself, and takes any set-point for the end of a take-off.
+        """
+        return self.config.vehicle.autopilot == "px4" or self.state.phase in MOVES_VEHICLE
 
     @property
     def pilot_took_over(self) -> bool:

@@ -30,6 +30,22 @@ class Phase(enum.Enum):
     HOLDING = 14
 
 
+MOVES_VEHICLE = frozenset(
+    {
+        Phase.APPROACH,
+        Phase.REACH,
+        Phase.CONTACT,
+        Phase.WRAP,
+        Phase.VERIFY,
+        Phase.PERCHED,
+        Phase.UNLOAD,
+        Phase.RELEASE,
+        Phase.DEPART,
+    }
+)
+"""Phases whose set-points the vehicle must follow."""
+
+
 @dataclass(frozen=True, slots=True)
 class Running:
     """The order that is being carried out, and where it ends."""

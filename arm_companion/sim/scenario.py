@@ -98,7 +98,7 @@ class Operator:
     async def _take_off(self) -> None:
         self._say("arm made ready, vehicle takes off")
         await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
-        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=30.0)
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=60.0)
         height = self._config.sim.takeoff_height_m
         await self._vehicle(
             mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"

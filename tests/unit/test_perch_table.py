@@ -8,8 +8,8 @@ from arm_companion.mission.diagram import document
 from arm_companion.mission.facts import ArmFault, ArmFlag, Order
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.mission import SAFE_ACTION
-from arm_companion.mission.perch import FLYING, GRASPING, GRIPPED, TABLE
-from arm_companion.mission.state import Phase
+from arm_companion.mission.perch import GRASPING, GRIPPED, TABLE
+from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.protocol.dialect import mav
 
 
@@ -43,7 +43,7 @@ def test_an_abort_is_legal_in_every_phase(phase: Phase) -> None:
     assert TABLE.order(Order.ABORT, phase) is not None
 
 
-@pytest.mark.parametrize("phase", sorted(FLYING, key=lambda p: p.value))
+@pytest.mark.parametrize("phase", sorted(MOVES_VEHICLE, key=lambda p: p.value))
 def test_every_phase_that_flies_ends_by_itself_in_time(phase: Phase) -> None:
     limited = {source for row in TABLE.transitions if "time limit" in row.label for source in row.sources}
     limited |= {Phase.REACH}  # its time limit is the search for contact
