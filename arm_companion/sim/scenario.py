@@ -18,6 +18,7 @@ _PULL_M = 0.010
 _HOLD_S = 3.0
 _PULL_S = 4.0
 _OFFBOARD = 6
+_GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
@@ -100,11 +101,20 @@ class Operator:
         await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
         await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=60.0)
         height = self._config.sim.takeoff_height_m
+        if self._ardupilot:
+            # it takes off by command in GUIDED only, PX4 in any mode but OFFBOARD; and it tells only what is asked
+            await self._take_external_control()
+            position = [float(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED), 100_000.0]
+            await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, position, "position messages")
         await self._vehicle(
             mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"
         )
         await self._wait(lambda: abs(self._height() - height) < 0.15, 30.0, "the vehicle does not reach its height")
         await asyncio.sleep(2.0)
+        if not self._ardupilot:
+            await self._take_external_control()
+
+    async def _take_external_control(self) -> None:
         self._say("external set-points on")
         await self._vehicle(mav.MAV_CMD_DO_SET_MODE, [_CUSTOM_MODE, self._external_mode()], "mode change")
         await self._wait(self._is_external, 5.0, "the autopilot does not take external set-points")
@@ -204,14 +214,18 @@ class Operator:
         heartbeat = self._heartbeat()
         return heartbeat is not None and bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
 
+    @property
+    def _ardupilot(self) -> bool:
+        return self._config.vehicle.autopilot == "ardupilot"
+
     def _external_mode(self) -> float:
-        return 4.0 if self._config.vehicle.autopilot == "ardupilot" else float(_OFFBOARD)
+        return float(_GUIDED if self._ardupilot else _OFFBOARD)
 
     def _is_external(self) -> bool:
         heartbeat = self._heartbeat()
         if heartbeat is None:
             return False
-        if self._config.vehicle.autopilot == "ardupilot":
+        if self._ardupilot:
             return bool(heartbeat.custom_mode == int(self._external_mode()))
         return bool((heartbeat.custom_mode >> 16) & 0xFF == _OFFBOARD)
 

@@ -7,6 +7,7 @@ the peer take turns, so that what else the machine does meets both. These are no
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from tests.bench.measure import Result
@@ -20,14 +21,19 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("build/bench.json"))
     arguments = parser.parse_args()
     results: list[Result] = []
-    print(f"{'':<44}{'ours':>11} {'unit':<6}{'peer':>11}  {'ratio':>8}  beside")
+    _say(f"{'':<44}{'ours':>11} {'unit':<6}{'peer':>11}  {'ratio':>8}  beside")
     for part in (mechanics, protocols):
         for result in part(arguments.rounds):
             results.append(result)
-            print(result.line(), flush=True)
+            _say(result.line())
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps([result.plain() for result in results], indent=1) + "\n", encoding="utf-8")
-    print(f"written: {arguments.output}")
+    _say(f"written: {arguments.output}")
+
+
+def _say(line: str) -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
 
 
 if __name__ == "__main__":

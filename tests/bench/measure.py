@@ -34,17 +34,25 @@ class Result:
         return f"{self.name:<44}{self.value:>11.4g} {self.unit:<6}{peer:>11}  {ratio:>8}  {self.peer or ''}"
 
 
-def seconds(work: Work, repeats: int = 1) -> float:
-    """Mean time of one call."""
+def seconds(work: Work, batch: int = 1) -> float:
+    """Mean time of one call in a batch."""
     begun = time.perf_counter()
-    for _ in range(repeats):
+    for _ in range(batch):
         work()
-    return (time.perf_counter() - begun) / repeats
+    return (time.perf_counter() - begun) / batch
 
 
-def medians(rounds: int, *works: tuple[Work, int]) -> list[float]:
-    """Median time of one call of each, s, in turns; each with its number of repeats a round."""
-    for work, _ in works:
+def medians(rounds: int, *works: tuple[Work, int, int]) -> list[float]:
+    """Median time of one call of each, s; the works take turns.
+
+    Args:
+        rounds: turns.
+        works: each with its number of samples in a turn, and of calls in a sample (for what is too short to time).
+    """
+    for work, _, _ in works:
         work()
-    taken = [[seconds(work, repeats) for work, repeats in works] for _ in range(rounds)]
-    return [statistics.median(column) for column in zip(*taken, strict=True)]
+    taken: list[list[float]] = [[] for _ in works]
+    for _ in range(rounds):
+        for samples, (work, count, batch) in zip(taken, works, strict=True):
+            samples += [seconds(work, batch) for _ in range(count)]
+    return [statistics.median(samples) for samples in taken]

@@ -37,40 +37,31 @@ def _mavlink(rounds: int) -> Iterator[Result]:
     count = len(messages)
     sender = MavlinkCodec(1, 1)
     frames = [sender.encode(message) for message in messages]
-    ours = MavlinkCodec(1, 192)
-    theirs = mav.MAVLink(None, 1, 192)
+    stream = [bytes((byte,)) for byte in b"".join(frames)]
+    ours, theirs = MavlinkCodec(1, 192), mav.MAVLink(None, 1, 192)
     theirs.robust_parsing = True
 
     def decode() -> None:
-        if sum(len(ours.feed(frame)) for frame in frames) != count:
-            raise RuntimeError("messages were lost")
+        _complete(sum(len(ours.feed(frame)) for frame in frames), count)
 
     def parse_buffer() -> None:
-        if sum(len(theirs.parse_buffer(frame) or ()) for frame in frames) != count:
-            raise RuntimeError("messages were lost")
+        _complete(sum(len(theirs.parse_buffer(frame) or ()) for frame in frames), count)
 
     def parse_char() -> None:
-        found = 0
-        for byte in b"".join(frames):
-            found += theirs.parse_char(bytes((byte,))) is not None
-        if found != count:
-            raise RuntimeError("messages were lost")
+        _complete(sum(theirs.parse_char(byte) is not None for byte in stream), count)
 
-    times = medians(rounds, (decode, 5), (parse_buffer, 5), (parse_char, 1))
+    times = medians(rounds, (decode, 5, 1), (parse_buffer, 5, 1), (parse_char, 1, 1))
     mine, buffer, char = (1e6 * t / count for t in times)
     yield Result("MAVLink, decode one message", mine, "us", "pymavlink parse_buffer", buffer)
     yield Result("MAVLink, decode one message", mine, "us", "pymavlink parse_char", char)
-
-    def encode() -> None:
-        for message in messages:
-            sender.encode(message)
-
-    def pack() -> None:
-        for message in messages:
-            message.pack(theirs)
-
-    mine, packed = (1e6 * t / count for t in medians(rounds, (encode, 5), (pack, 5)))
+    encode, pack = (lambda: [sender.encode(m) for m in messages]), (lambda: [m.pack(theirs) for m in messages])
+    mine, packed = (1e6 * t / count for t in medians(rounds, (encode, 5, 1), (pack, 5, 1)))
     yield Result("MAVLink, encode one message", mine, "us", "pymavlink pack", packed)
+
+
+def _complete(found: int, count: int) -> None:
+    if found != count:
+        raise RuntimeError(f"{found} of {count} messages came through")
 
 
 class _MemoryPort:
@@ -142,5 +133,5 @@ def _dynamixel(rounds: int) -> Iterator[Result]:
         port.is_using = False
         writer.txPacket()
 
-    mine, maker = (1e6 * t for t in medians(rounds, (ours, 200), (theirs, 100)))
+    mine, maker = (1e6 * t for t in medians(rounds, (ours, 5, 60), (theirs, 5, 30)))
     yield Result("Dynamixel, codec work of one cycle", mine, "us", "the maker's SDK", maker)

@@ -8,7 +8,7 @@ import numpy as np
 from arm_companion.config import Config
 from arm_companion.sim import mjcf
 
-_AT_REST = 1e-3  # rad/s or m/s, of any hinge
+_AT_REST = 2e-5  # rad/s or m/s, of any hinge
 _LONGEST = 20_000  # steps
 _DAMPING = 4.0  # times the plant's: about critical, the quickest way to rest
 

@@ -9,18 +9,18 @@ import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
+from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.parameters import ArmParameters
 
 
 class ShootingSolver:
     """Keeps its last answer to start from, as every solver here does."""
 
-    def __init__(self, parameters: ArmParameters, pull: np.ndarray, gravity: np.ndarray) -> None:
+    def __init__(self, parameters: ArmParameters, pull: np.ndarray, gravity: np.ndarray, first: ArmSolution) -> None:
         self.P, self.s = parameters, parameters.segments[0]
         self.pull, self.gravity = pull, gravity
         self.c, self.d = np.cos(parameters.angles), np.sin(parameters.angles)
-        weight = self.s.line_mass * self.s.L + self.s.end_mass
-        self.x = np.concatenate((weight * gravity, np.zeros(3), parameters.T0))
+        self.x = np.concatenate((first.base_wrench, first.tension))
         self.scale = np.concatenate((np.full(3, 0.3), np.full(3, 0.08), np.full(parameters.n, 1.0)))
 
     def _section(self, _s: float, y: np.ndarray, tau: np.ndarray, twist: float) -> np.ndarray:
@@ -43,15 +43,17 @@ class ShootingSolver:
         tau = np.maximum(x[6:], 0.0)
         y = np.concatenate((np.zeros(3), np.eye(3).ravel(), x[:6], np.zeros(self.P.n)))
         twist = self.s.GJ + self.s.r**2 * tau.sum()
-        end = solve_ivp(self._section, (0, self.s.L), y, args=(tau, twist), rtol=1e-7, atol=1e-10).y[:, -1]
+        end = solve_ivp(self._section, (0, self.s.L), y, args=(tau, twist), method="DOP853", rtol=1e-6, atol=1e-9).y[
+            :, -1
+        ]
         E = end[3:12].reshape(3, 3) @ rotation.T
         turn = 0.5 * np.array((E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]))
-        stretch = x[6:] - (self.P.T0 + self.P.k_T * (self.pull + end[18:]))
-        return np.concatenate(((end[:3] - position) / self.s.L, turn, stretch))
+        stretch = (x[6:] - self.P.T0) / self.P.k_T - self.pull - end[18:]
+        return np.concatenate(((end[:3] - position) / self.s.L, turn, stretch / self.s.r))
 
     def solve(self, position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
         """Wrench (6,) on the carrier at the base point with the tip clamped there."""
-        found = root(self._miss, self.x / self.scale, args=(position, rotation), method="hybr", tol=1e-7)
+        found = root(self._miss, self.x / self.scale, args=(position, rotation), method="hybr", tol=1e-6)
         if not found.success:
             raise RuntimeError(found.message)
         self.x = found.x * self.scale
