@@ -17,11 +17,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from arm_companion.arm.model import ArmModel, ArmSolution, Payload
+from arm_companion.arm.parameters import ArmParameters
 from arm_companion.errors import NoSolution
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen
 
 _ITERATIONS = 60
-_TOLERANCE = 1e-5  # of z
+_TOLERANCE = 1e-10  # m of tendon, of the drag
+_LEAST_REACH = 1e-9  # m; keeps a slack tendon's memory defined
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,28 +90,35 @@ def step(
     """
     P = model.parameters
     q = frozen(pull, (P.n,), "pull")
-    z = before.z
     solution = start or model.free(q, gravity, tip_wrench, payload)
-    relaxation, last = 1.0, None
+    z, reach = before.z, _reach(P, mu, q, solution)
     for _ in range(_ITERATIONS):
-        Phi = loss(mu, turning(solution))
-        # tau = k_T stretch without friction; the arm sees tau (1 - z Phi), as if less had been pulled in.
-        path = -solution.detail.path_beyond(0.0)
-        free = np.maximum(P.T0 + P.k_T * (q + path), 0.0)
-        solution = model.free(q - z * Phi * free / P.k_T, gravity, tip_wrench, payload, start=solution)
-        path = -solution.detail.path_beyond(0.0)
-        reach = np.maximum(free * Phi / P.k_T, 1e-9)
-        target = np.clip(before.z - (path - before.path) / reach, -1.0, 1.0)
-        rest = target - z
-        if float(np.abs(rest).max()) < _TOLERANCE:
+        # The arm sees tau (1 - z Phi), as if z tau Phi / k_T less had been pulled in.
+        drag = z * reach
+        solution = model.free(q - drag, gravity, tip_wrench, payload, start=solution)
+        path, reach = -solution.detail.path_beyond(0.0), _reach(P, mu, q, solution)
+        wish = before.z - (path - before.path) / reach
+        target = np.clip(wish, -1.0, 1.0)
+        # The force must be that of this equilibrium, not only its direction.
+        if float(np.abs(target * reach - drag).max()) < _TOLERANCE:
             return solution, Grip(target, path)
-        # Aitken's relaxation: the tendon's own stiffness closes this loop with a gain of either sign.
-        if last is not None:
-            change = rest - last
-            relaxation *= -float(last @ change) / max(float(change @ change), 1e-18)
-            relaxation = min(max(relaxation, 0.2), 1.5)
-        z, last = z + relaxation * rest, rest
-    raise NoSolution(float(np.abs(target - z).max()), "friction and equilibrium do not agree")
+        # Newton on target(z) = z: a tendon that sticks gives way with the arm, one that slides does not answer.
+        sticks = (wish > -1.0) & (wish < 1.0)
+        slope = sticks[:, None] * _give(P, solution.tension) * reach / reach[:, None]
+        z = z + np.linalg.solve(np.eye(P.n) + slope, target - z)
+    raise NoSolution(float(np.abs(target * reach - drag).max() / reach.max()), "friction and equilibrium do not agree")
+
+
+def _reach(P: ArmParameters, mu: float, pull: Array, solution: ArmSolution) -> Array:
+    """tau Phi / k_T (n,), m: what a tendon stretches, either way, before it slides through this solution's bend."""
+    stretch = P.T0 / P.k_T + pull - solution.detail.path_beyond(0.0)
+    return np.maximum(loss(mu, turning(solution)) * np.maximum(stretch, 0.0), _LEAST_REACH)
+
+
+def _give(P: ArmParameters, tension: Array) -> Array:
+    """By how much the unloaded arm shortens every path (n, n) per tendon taken in, taut ones resisting."""
+    k = P.k_T * (tension > 0)
+    return np.asarray(P.H @ np.linalg.solve(np.diag(P.bending) + P.H.T @ (k[:, None] * P.H), P.H.T * k))
 
 
 def cycle(

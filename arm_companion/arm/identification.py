@@ -26,8 +26,12 @@ NAMES = ("EI", "k_T", "T0", "mu")
 POSITION, SHIFT, TENSION = "tip position", "tip shift", "tension"
 
 _FLOOR = {POSITION: 1e-7, SHIFT: 1e-7, TENSION: 1e-5}  # scatter below which data count as exact, m and N
+_BEST = {POSITION: 1e-5, SHIFT: 1e-5, TENSION: 1e-2}  # scatter that no measurement beats, to sort out what is hopeless
 _GUESS = {POSITION: 1e-3, SHIFT: 1e-3, TENSION: 0.3}  # scatter to begin with
 _ROUNDS = 4  # of weights
+_LOOK = 1e-3  # of a parameter, for derivatives
+_FACTOR = math.log(20)  # by which a parameter may leave its configured value
+_MU_MAX = 2.0
 _USELESS = 0.5  # one sigma, relative, above which a parameter is not told by the test
 _MU_USELESS = 0.2
 _CONFIDENCE = 0.95
@@ -161,18 +165,18 @@ def fit(
     before = problem.scatter(problem.predict({}), 0)
     notes: list[str] = []
     x = {name: (0.1 if name == "mu" and mu == 0 else problem.begin(name)) for name in asked}
-    while True:
-        if not x:
-            raise NotIdentifiable("the test tells nothing of " + ", ".join(asked))
-        solved = _weighted(problem, x)
-        useless = solved.worst()
-        if useless is None:
-            break
-        name, sigma = useless
-        notes.append(f"{name} stays as configured: the test would tell it to +-{100 * sigma:.0f} % only")
-        if name == "mu":
-            notes[-1] = f"mu stays as configured: the test would tell it to +-{sigma:.2g} only"
-        x = {other: solved.x[other] for other in solved.x if other != name}
+    # First without what even a perfect measurement would not tell, then without what this one does not.
+    for judge in (problem.at, problem.fitted):
+        solved = judge(x)
+        while hopeless := _worst(solved.x, solved.covariance):
+            name, sigma = hopeless
+            share = f"{sigma:.2g}" if name == "mu" else f"{min(100 * sigma, 999):.0f} %"
+            notes.append(f"{name} stays as configured: the test tells it to +-{share} at best")
+            x = {other: value for other, value in solved.x.items() if other != name}
+            if not x:
+                raise NotIdentifiable("the test tells nothing of " + ", ".join(asked))
+            solved = judge(x)
+        x = solved.x
     return _result(problem, solved, before, notes)
 
 
@@ -258,6 +262,37 @@ class _Problem:
                 result[k] = seen[i].tip_position[j] - (first[i].tip_position[j] if kind == SHIFT else 0.0)
         return result
 
+    def at(self, x: Mapping[str, float]) -> "_Solved":
+        """How well a perfect measurement would tell these parameters, about these values."""
+        here = self.predict(x)
+        J = np.column_stack([(self.predict({**x, name: x[name] + _LOOK}) - here) / _LOOK for name in x])
+        return _Solved(dict(x), _covariance(J, _BEST, self.channels), here, dict(_BEST))
+
+    def fitted(self, start: Mapping[str, float]) -> "_Solved":
+        """Fit and weights in turn until the weights stay."""
+        names = list(start)
+        x = np.array([start[name] for name in names])
+        lower = np.array([0.0 if name == "mu" else -_FACTOR for name in names])
+        upper = np.array([_MU_MAX if name == "mu" else _FACTOR for name in names])
+        scatter = {kind: _GUESS[kind] for kind in _GUESS if kind in self.channels}
+        predicted = self.measured
+        J = np.zeros((len(self.measured), len(names)))
+        for _ in range(_ROUNDS):
+            weight = 1 / np.array([scatter[kind] for kind in self.channels])
+
+            def residual(values: Array, weight: Array = weight) -> Array:
+                predicted = self.predict(dict(zip(names, values.tolist(), strict=True)))
+                return np.asarray((predicted - self.measured) * weight)
+
+            x, r, J = levenberg_marquardt(residual, x, lower, upper)
+            predicted = self.measured + r / weight
+            J = J / weight[:, None]
+            old, scatter = scatter, self.scatter(predicted, len(names))
+            if len(scatter) == 1 or all(abs(scatter[kind] / old[kind] - 1) < 0.02 for kind in scatter):
+                break
+        covariance = _covariance(J, scatter, self.channels)
+        return _Solved(dict(zip(names, x.tolist(), strict=True)), covariance, predicted, scatter)
+
     def scatter(self, predicted: Array, fitted: int) -> dict[str, float]:
         """One sigma of every kind about a prediction with `fitted` free parameters."""
         names = np.array(self.channels)
@@ -277,43 +312,20 @@ class _Solved:
     predicted: Array
     scatter: dict[str, float]
 
-    def worst(self) -> tuple[str, float] | None:
-        """The parameter that the test tells least of, if too little."""
-        ratio = []
-        for k, name in enumerate(self.x):
-            sigma = math.sqrt(max(float(self.covariance[k, k]), 0.0))
-            ratio.append((sigma / (_MU_USELESS if name == "mu" else _USELESS), name, sigma))
-        share, name, sigma = max(ratio)
-        return (name, sigma) if not share <= 1 else None
+
+def _worst(x: Mapping[str, float], covariance: Array) -> tuple[str, float] | None:
+    """The parameter that the test tells least of, if too little, and its one sigma."""
+    sigmas = np.sqrt(np.diag(covariance)).tolist()
+    ratios = [(s / (_MU_USELESS if name == "mu" else _USELESS), name, s) for name, s in zip(x, sigmas, strict=True)]
+    share, name, sigma = max(ratios)
+    return (name, sigma) if share > 1 else None
 
 
-def _weighted(problem: _Problem, start: Mapping[str, float]) -> _Solved:
-    """Fit and weights in turn until the weights stay."""
-    names = list(start)
-    x = np.array([start[name] for name in names])
-    lower = np.array([0.0 if name == "mu" else -math.inf for name in names])
-    scatter = {kind: _GUESS[kind] for kind in _GUESS if kind in problem.channels}
-    predicted = problem.measured
-    J = np.zeros((len(problem.measured), len(names)))
-    for _ in range(_ROUNDS):
-        weight = 1 / np.array([scatter[kind] for kind in problem.channels])
-
-        def residual(values: Array, weight: Array = weight) -> Array:
-            predicted = problem.predict(dict(zip(names, values.tolist(), strict=True)))
-            return np.asarray((predicted - problem.measured) * weight)
-
-        x, r, J = levenberg_marquardt(residual, x, lower)
-        predicted = problem.measured + r / weight
-        J = J / weight[:, None]
-        old, scatter = scatter, problem.scatter(predicted, len(names))
-        if len(scatter) == 1 or all(abs(scatter[kind] / old[kind] - 1) < 0.02 for kind in scatter):
-            break
-    weight = 1 / np.array([scatter[kind] for kind in problem.channels])
-    information = (J * weight[:, None]).T @ (J * weight[:, None])
-    # Barely told combinations get a huge variance, not a division by zero.
-    values, axes = np.linalg.eigh(information)
-    covariance = axes @ ((1 / np.maximum(values, 1e-6))[:, None] * axes.T)
-    return _Solved(dict(zip(names, x.tolist(), strict=True)), covariance, predicted, scatter)
+def _covariance(J: Array, scatter: Mapping[str, float], channels: Sequence[str]) -> Array:
+    """Of the parameters (p, p); barely told combinations get a huge variance, not a division by zero."""
+    weighted = J / np.array([scatter[kind] for kind in channels])[:, None]
+    values, axes = np.linalg.eigh(weighted.T @ weighted)
+    return np.asarray(axes @ ((1 / np.maximum(values, 1e-6))[:, None] * axes.T))
 
 
 def _result(problem: _Problem, solved: _Solved, before: dict[str, float], notes: list[str]) -> Fit:

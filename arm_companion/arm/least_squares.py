@@ -1,4 +1,4 @@
-"""A small nonlinear least-squares fit: Levenberg and Marquardt with lower bounds, and the t that its intervals need.
+"""A small nonlinear least-squares fit: Levenberg and Marquardt between bounds, and the t that its intervals need.
 
 A handful of parameters and a residual that is smooth in them need no library; the daemon's machine has none.
 """
@@ -17,9 +17,16 @@ _CONVERGED = 1e-5  # largest step of a parameter
 
 
 def levenberg_marquardt(
-    residual: Callable[[Array], Array], start: Array, lower: Array, step: float = _STEP
+    residual: Callable[[Array], Array], start: Array, lower: Array, upper: Array, step: float = _STEP
 ) -> tuple[Array, Array, Array]:
-    """The x >= lower that makes the sum of squares of `residual(x)` least.
+    """The x between `lower` and `upper` that makes the sum of squares of `residual(x)` least.
+
+    Args:
+        residual: (q,) of x (p,); a `ModelError` from it makes the step shorter.
+        start: x to begin with.
+        lower: bounds (p,).
+        upper: bounds (p,).
+        step: of a parameter, for derivatives.
 
     Returns:
         x (p,), residual (q,) there and Jacobian (q, p) by forward differences, at most one converged step old.
@@ -32,14 +39,14 @@ def levenberg_marquardt(
     J = _jacobian(residual, x, r, step)
     for _ in range(_ITERATIONS):
         gradient = J.T @ r
-        held = (x <= lower) & (gradient > 0)  # on the bound, and pressed against it
+        held = ((x <= lower) & (gradient > 0)) | ((x >= upper) & (gradient < 0))  # pressed against a bound
         A = J.T @ J
         scale = np.diag(A) + 1e-12 * float(np.trace(A))
         A = A + damping * np.diag(scale)
         A[held] = 0.0
         A[:, held] = 0.0
         A[held, held] = 1.0
-        trial = np.maximum(x - np.linalg.solve(A, np.where(held, 0.0, gradient)), lower)
+        trial = np.clip(x - np.linalg.solve(A, np.where(held, 0.0, gradient)), lower, upper)
         move = float(np.abs(trial - x).max())
         try:
             r_trial = residual(trial)

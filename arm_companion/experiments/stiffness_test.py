@@ -17,7 +17,6 @@ from arm_companion.arm import friction
 from arm_companion.arm.model import ArmSolution, Payload
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
-from arm_companion.arm.stiffness import stiffness_along
 from arm_companion.errors import ModelError
 from arm_companion.experiments.case import GRAVITY, goals
 from arm_companion.geometry.arrays import Array, ArrayLike
@@ -68,7 +67,7 @@ class Curve:
     Attributes:
         bend_deg: commanded.
         inward: along +x_e, else along -x_e.
-        initial: stiffness against the first grain of load, N/m; the same inward and outward.
+        initial: first grain of load over its deflection, N/m; the same inward and outward.
         readings: in the order of time.
         refusal: why the curve ends early; empty when it does not.
     """
@@ -162,7 +161,8 @@ def _curve(
     initial = math.nan
     try:
         rest = model.free(pull, gravity)
-        initial = stiffness_along(rest.compliance, rest.tip_rotation[:, 0])
+        give = rest.compliance[:3, :3] @ rest.tip_rotation[:, 0]
+        initial = 1 / math.sqrt(float(give @ give))
         readings.append(_reading(bend_deg, inward, 1, True, 0.0, rest, rest))
         now, grip = rest, friction.Grip.relaxed(rest)
         for cycle, loading, force in schedule:

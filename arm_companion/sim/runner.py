@@ -29,7 +29,7 @@ _STOP_WITHIN_S = 5.0
 Prepare = Callable[[World], None]
 
 
-@dataclass
+@dataclass(repr=False)  # asyncio's runner makes the text of a task's result, which here is a whole flight
 class Result:
     """What a flight leaves behind."""
 

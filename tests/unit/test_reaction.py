@@ -238,6 +238,30 @@ def test_friction_makes_a_loop_that_closes_and_vanishes_with_its_coefficient():
     assert wide[9] - wide[3] > 1.1 * (down - up)
 
 
+@pytest.mark.parametrize("mu", [0.1, 0.3, 0.6])
+def test_friction_belongs_to_the_equilibrium_it_is_returned_with(mu):
+    """Drag by the capstan law at this solution, not at the one before: otherwise it depends on how loads are stepped."""
+    pull = MODEL.pull_for_bend((0.5, 0.2))
+    solution = MODEL.free(pull, DOWN)
+    grip = friction.Grip.relaxed(solution)
+    for force in (0.2, 0.4, 0.8, 0.9, 0.5, 0.1, 0.3):
+        solution, grip = friction.step(MODEL, mu, grip, pull, DOWN, (force, 0, 0, 0, 0, 0), start=solution)
+        stretch = np.maximum(P.T0 / P.k_T + pull + grip.path, 0.0)
+        drag = grip.z * friction.loss(mu, friction.turning(solution)) * stretch
+        assert np.allclose(pull - solution.pull, drag, rtol=0, atol=1e-9)
+        assert np.allclose(grip.path, -solution.detail.path_beyond(0.0), atol=1e-12)
+
+
+def test_a_sliding_branch_does_not_depend_on_the_steps_that_led_there():
+    pull = MODEL.pull_for_bend((0.5, 0.0))
+
+    def last(count):
+        loads = [(f, 0, 0, 0, 0, 0) for f in np.linspace(0.0, 0.9, count)]
+        return friction.cycle(MODEL, 0.3, pull, DOWN, loads)[-1].tip_position
+
+    assert np.allclose(last(4), last(19), atol=2e-5)
+
+
 @pytest.mark.parametrize("x", [0.0, 1e-6, 9.9e-4, 1.01e-3, 0.5])
 def test_loss_is_the_mean_of_the_capstan_law(x):
     s = (np.arange(2000) + 0.5) / 2000
