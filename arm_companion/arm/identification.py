@@ -159,6 +159,8 @@ def fit(
     asked = [name for name in NAMES if name in names]
     if unknown := set(names) - set(NAMES):
         raise NotIdentifiable(f"no such parameter: {', '.join(sorted(unknown))}")
+    if not asked:
+        raise NotIdentifiable("nothing is asked for")
     problem = _Problem(parameters, test, mu, fast)
     if len(problem.measured) <= len(asked):
         raise NotIdentifiable(f"{len(problem.measured)} measured values for {len(asked)} parameters")

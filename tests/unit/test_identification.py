@@ -15,9 +15,10 @@ from arm_companion.arm.identification import LoadingTest, NotIdentifiable, Readi
 from arm_companion.arm.least_squares import levenberg_marquardt, student
 from arm_companion.arm.parameters import ArmParameters, Guides
 from arm_companion.arm.rod_model import RodModel
+from arm_companion.cli.calibrate import drop_in
 from arm_companion.config import Config, load
 from arm_companion.errors import NoSolution
-from arm_companion.experiments import case, loading_csv
+from arm_companion.experiments import case, loading_csv, stiffness_test
 
 HANGING = np.array((0.0, 0.0, 9.81))
 NONE = np.full(3, math.nan)
@@ -75,7 +76,9 @@ def truth(nominal: ArmParameters) -> dict[str, float]:
 def test_least_squares_finds_a_minimum_and_its_slope() -> None:
     t = np.linspace(0, 2, 20)
     data = 3 * np.exp(-1.3 * t)
-    x, r, J = levenberg_marquardt(lambda p: p[0] * np.exp(-p[1] * t) - data, np.array((1.0, 0.2)), np.full(2, -np.inf))
+    x, r, J = levenberg_marquardt(
+        lambda p: p[0] * np.exp(-p[1] * t) - data, np.array((1.0, 0.2)), np.full(2, -9.0), np.full(2, 9.0)
+    )
     assert np.allclose(x, (3, 1.3), atol=1e-6)
     assert np.abs(r).max() < 1e-6
     assert np.allclose(J, np.column_stack((np.exp(-1.3 * t), -3 * t * np.exp(-1.3 * t))), atol=5e-3)
@@ -83,14 +86,16 @@ def test_least_squares_finds_a_minimum_and_its_slope() -> None:
 
 def test_least_squares_stops_at_a_bound_and_still_fits_the_rest() -> None:
     x, _, _ = levenberg_marquardt(
-        lambda p: np.array((p[0] + 2, p[0] + p[1] - 1, p[1] - 3)), np.array((1.0, 0.0)), np.array((0.0, -np.inf))
+        lambda p: np.array((p[0] + 2, p[0] + p[1] - 1, p[1] - 3)), np.array((1.0, 0.0)), np.zeros(2), np.full(2, 9.0)
     )
     assert np.allclose(x, (0, 2), atol=1e-6)
+    x, _, _ = levenberg_marquardt(lambda p: p - (3, 0.5), np.zeros(2), np.zeros(2), np.ones(2))
+    assert np.allclose(x, (1, 0.5), atol=1e-6)
 
 
 def test_least_squares_gives_up_rather_than_go_astray() -> None:
     with pytest.raises(NoSolution):
-        levenberg_marquardt(lambda p: np.exp(-p), np.array((0.0,)), np.array((-np.inf,)))
+        levenberg_marquardt(lambda p: np.exp(-p), np.array((0.0,)), np.array((-1e9,)), np.array((1e9,)))
 
 
 @pytest.mark.parametrize("degrees", [3, 5, 10, 40, 400])
@@ -113,7 +118,7 @@ def test_exact_data_give_the_exact_arm(nominal: ArmParameters, exact: tuple[Read
 
 def test_intervals_cover_and_scatter_is_the_noise(nominal: ArmParameters, exact: tuple[Reading, ...]) -> None:
     inside = trials = 0
-    for seed in range(8):
+    for seed in range(5):
         fit = ident.fit(nominal, noisy(exact, seed), ("EI", "k_T", "T0"))
         assert fit.scatter[ident.POSITION] == pytest.approx(5e-4, rel=0.45)
         assert fit.scatter[ident.TENSION] == pytest.approx(0.1, rel=0.45)
@@ -123,7 +128,7 @@ def test_intervals_cover_and_scatter_is_the_noise(nominal: ArmParameters, exact:
             assert abs(e.value / value - 1) < 5 * e.sigma / e.value
             inside += e.lower <= value <= e.upper
             trials += 1
-    assert inside >= 19  # of 24 at 95 %: fewer has a chance of 1 in 100
+    assert inside >= 12  # of 15 at 95 %: fewer has a chance of 1 in 200
 
 
 def test_displacements_alone_do(nominal: ArmParameters, exact: tuple[Reading, ...]) -> None:
@@ -166,11 +171,9 @@ def test_what_a_test_does_not_tell_stays_as_configured(exact: tuple[Reading, ...
 
 
 def test_friction_comes_back_from_a_loop(nominal: ArmParameters) -> None:
-    from arm_companion.experiments import stiffness_test
-
     mu = 0.25
     model = RodModel(nominal)
-    curves = stiffness_test.run(nominal, bends_deg=[45.0], mu=mu, steps=3, cycles=1)
+    curves = stiffness_test.run(nominal, bends_deg=[45.0], mu=mu, steps=2, cycles=1)
     pull = case.goals(nominal, 45.0)
     rest = model.free(pull, np.zeros(3)).tip_position
     rng = np.random.default_rng(2)
@@ -200,6 +203,8 @@ def test_too_little_data_and_unknown_names_are_refused(nominal: ArmParameters, e
     bare = Reading("a", exact[0].pull, np.zeros(3), np.zeros(3), exact[0].position, NONE, np.full(4, math.nan))
     with pytest.raises(NotIdentifiable, match="3 measured values for 4"):
         ident.fit(nominal, LoadingTest((bare,), HANGING))
+    with pytest.raises(NotIdentifiable, match="nothing is asked for"):
+        ident.fit(nominal, LoadingTest(exact, HANGING), ())
     with pytest.raises(NotIdentifiable, match="no such parameter: rho"):
         ident.fit(nominal, LoadingTest(exact, HANGING), ("EI", "rho"))
 
@@ -258,7 +263,7 @@ def test_goals_and_loads_are_read_where_they_stand() -> None:
     assert np.allclose(second.force, (0, 0, -0.5))
     assert np.allclose(second.follower, 0)
     assert second.shift[0] == 0.004
-    assert np.isnan(second.shift[1:]).all() and np.isnan(second.position).all() and np.isnan(second.tension).all()
+    assert np.isnan([*second.shift[1:], *second.position, *second.tension]).all()
 
 
 def calibrate(*words: object) -> int:
@@ -283,10 +288,10 @@ def test_the_command_fits_writes_and_what_it_writes_is_the_arm(
     assert figure.read_bytes().startswith(b"\x89PNG")
     (tmp_path / "fit" / "mine.toml").write_text('extends = "arm.toml"\n[arm]\npulley_radius_m = 0.012\n')
     arm = ArmParameters.of(load(tmp_path / "fit" / "mine.toml").arm)
-    assert arm.EI == pytest.approx(found["EI_n_m2"]["value"], rel=1e-5)
+    assert pytest.approx(found["EI_n_m2"]["value"], rel=1e-5) == arm.EI
     assert arm.k_T[0] == pytest.approx(found["k_T_n_per_m"]["value"], rel=1e-5)
     assert arm.T0[0] == pytest.approx(found["T0_n"]["value"], rel=1e-5)
-    assert arm.EI == pytest.approx(truth(nominal)["EI"], rel=0.02)
+    assert pytest.approx(truth(nominal)["EI"], rel=0.02) == arm.EI
 
 
 def test_the_command_prints_a_table(
@@ -301,31 +306,19 @@ def test_the_command_prints_a_table(
     assert "8 readings, 56 values, 55 degrees of freedom" in out
 
 
-def test_a_stiff_servo_in_series_is_kept_and_a_soft_one_that_contradicts_is_not() -> None:
-    from arm_companion.cli.calibrate import drop_in
-
-    config = load("zhao2022.toml", ["arm.tendons.servo_stiffness_n_per_m=20000"])
-    estimate = ident.Estimate(3000.0, 30.0, 2940.0, 3060.0, fitted=True)
+@pytest.mark.parametrize("servo", [20000.0, 2000.0])  # stiffer, and softer than the whole that was measured
+def test_servo_stiffness_in_series_is_kept_unless_it_contradicts(tmp_path: Path, servo: float) -> None:
+    k_T = ident.Estimate(3000.0, 30.0, 2940.0, 3060.0, fitted=True)
     still = ident.Estimate(1.0, 0.0, 1.0, 1.0, fitted=False)
-    fit = ident.Fit(
-        {"EI": still, "k_T": estimate, "T0": still, "mu": still},
-        np.eye(1), {}, {}, (), (), np.zeros(0), np.zeros(0), 1, (),
-    )  # fmt: skip
-
-    def stiffness(soft: Config, base: Path, target: Path) -> float:
-        target.write_text(drop_in(fit, soft, base, target), encoding="utf-8")
-        return float(ArmParameters.of(load(target).arm).k_T[0])
-
-    import tempfile
-
-    with tempfile.TemporaryDirectory() as folder:
-        base = Path(folder) / "base.toml"
-        base.write_text("[arm.tendons]\nservo_stiffness_n_per_m = 20000.0\n", encoding="utf-8")
-        assert stiffness(config, base, Path(folder) / "a.toml") == pytest.approx(3000, rel=1e-5)
-        assert 'extends = "base.toml"' in (Path(folder) / "a.toml").read_text(encoding="utf-8")
-        soft = load("zhao2022.toml", ["arm.tendons.servo_stiffness_n_per_m=2000"])
-        base.write_text("[arm.tendons]\nservo_stiffness_n_per_m = 2000.0\n", encoding="utf-8")
-        assert stiffness(soft, base, Path(folder) / "b.toml") == pytest.approx(3000, rel=1e-5)
+    estimates = {"EI": still, "k_T": k_T, "T0": still, "mu": still}
+    fit = ident.Fit(estimates, np.eye(1), {}, {}, (), (), np.zeros(0), np.zeros(0), 1, ())
+    base, target = tmp_path / "base.toml", tmp_path / "fit.toml"
+    base.write_text(f"[arm.tendons]\nservo_stiffness_n_per_m = {servo}\n", encoding="utf-8")
+    target.write_text(drop_in(fit, load(base), base, target), encoding="utf-8")
+    fitted = load(target).arm
+    assert ArmParameters.of(fitted).k_T[0] == pytest.approx(3000, rel=1e-5)
+    assert (fitted.tendons.servo_stiffness_n_per_m == servo) is (servo > 3000)
+    assert 'extends = "base.toml"' in target.read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -240,7 +240,7 @@ def test_friction_makes_a_loop_that_closes_and_vanishes_with_its_coefficient():
 
 @pytest.mark.parametrize("mu", [0.1, 0.3, 0.6])
 def test_friction_belongs_to_the_equilibrium_it_is_returned_with(mu):
-    """Drag by the capstan law at this solution, not at the one before: otherwise it depends on how loads are stepped."""
+    """Drag by the capstan law at this solution, not the one before; else it depends on how loads are stepped."""
     pull = MODEL.pull_for_bend((0.5, 0.2))
     solution = MODEL.free(pull, DOWN)
     grip = friction.Grip.relaxed(solution)

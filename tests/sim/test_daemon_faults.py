@@ -1,0 +1,36 @@
+"""The daemon when its own cycle fails: the arm holds, the link lives, and people are told."""
+
+from typing import Any
+
+import pytest
+
+from arm_companion import app
+from arm_companion.clock import run_simulated
+from arm_companion.config import load
+from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.world import World
+
+
+def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load("sim.toml")
+    calls = 0
+    real = app.step
+
+    def sometimes(*arguments: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if 300 <= calls < 330:
+            raise RuntimeError("a bug")
+        return real(*arguments)
+
+    def end_soon(world: World) -> None:
+        world.at(6.0, lambda w: w.autopilot.fail())
+
+    monkeypatch.setattr(app, "step", sometimes)
+    result = run_simulated(fly_simulated(config, lambda _: None, end_soon))
+    assert result.cycles - len(result.records) == 30, "failed cycles are not recorded, all others are"
+    assert any("cycle failed" in text and "hold" in text for _, text in result.flight.texts)
+    before, after = result.records[299], result.records[300]
+    assert after.t - before.t > 0.25, "the cycle goes on after the failure"
+    assert [t.pull for t in after.facts.tendons] == pytest.approx([t.pull for t in before.facts.tendons], abs=5e-4)
+    assert all(t.torque and t.ready for t in after.facts.tendons), "the arm held, and follows again"
