@@ -30,7 +30,7 @@ def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest
     result = run_simulated(fly_simulated(config, lambda _: None, end_soon))
     assert result.cycles - len(result.records) == 30, "failed cycles are not recorded, all others are"
     assert any("cycle failed" in text and "hold" in text for _, text in result.flight.texts)
-    before, after = result.records[299], result.records[300]
+    before, after = result.records[298], result.records[299]
     assert after.t - before.t > 0.25, "the cycle goes on after the failure"
     assert [t.pull for t in after.facts.tendons] == pytest.approx([t.pull for t in before.facts.tendons], abs=5e-4)
     assert all(t.torque and t.ready for t in after.facts.tendons), "the arm held, and follows again"

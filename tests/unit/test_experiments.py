@@ -4,7 +4,9 @@ import csv
 import itertools
 import json
 import math
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -235,3 +237,12 @@ def test_the_tables_show_one_number_where_the_branches_coincide(capsys: pytest.C
     out = capsys.readouterr().out
     assert "68.542" in out
     assert " / " not in out.split("\n", 1)[1].split("outward")[0]
+
+
+def test_the_documentations_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "model.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    found: dict[str, Any] = {}
+    exec(example, found)
+    assert found["held"].base_wrench[2] == pytest.approx(-3.675, abs=1e-3)
+    assert capsys.readouterr().out.count("\n") > 5
