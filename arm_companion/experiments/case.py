@@ -153,7 +153,7 @@ def stiffness(compliance: Array) -> Array:
 def k_psi(solution: ArmSolution, parameters: ArmParameters, delta: float = 0.0) -> Array:
     """The paper's K_psi, its sign put right, at the solution's mean bend (2, 2), N m/rad; one segment.
 
-    K_psi = H - [dJ_q^T/dpsi] tau + J_q^T K_q J_q - [dJ_x^T/dpsi] w over taut tendons (the paper's eq. 16 prints a
+    K_psi = H - [dJ_q^T/dpsi] tau + J_q^T K_q J_q - [dJ_x^T/dpsi] w over taut tendons (the paper's eq. 17 prints a
     minus before the third term and leaves the last out). Here by the chain rule from u = theta (cos delta,
     sin delta): T^T K_u T + g . d2u/dpsi2, with g the force on u that backbone, tendons and tip load leave. The
     arm's weight does not count, and a tip load counts as dead.
