@@ -141,9 +141,9 @@ def _at_rest(s: Situation) -> bool:
     return s.state.bend == s.state.bend_goal or not all(tendon.torque for tendon in s.facts.tendons)
 
 
-def _here(s: Situation, yaw: float | None = None) -> Reference:
+def _here(s: Situation) -> Reference:
     vehicle = s.facts.vehicle
-    return Reference(vehicle.position_w, ZERO, yaw_of(vehicle.attitude_wb) if yaw is None else yaw)
+    return Reference(vehicle.position_w, ZERO, yaw_of(vehicle.attitude_wb))
 
 
 def _reference(s: Situation) -> Reference | None:

@@ -9,10 +9,10 @@ what is left over is a force from outside.
 import math
 from dataclasses import dataclass, replace
 
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import TendonState, Vec3, VehicleState
 from arm_companion.mission.motion import add, norm, rotate, scale, sub
 
-GRAVITY = 9.80665
 _POLE = 9.0  # rad/s, both poles of the observer
 OBSERVER_LAG_S = 2.0 / _POLE
 _TARE_S = 1.0

@@ -46,7 +46,7 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.VEHICLE_CONNECTED: vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s,
         ArmFlag.VEHICLE_STATE_FRESH: s.vehicle_fresh,
         ArmFlag.EXTERNAL_CONTROL: s.external,
-        ArmFlag.SETPOINTS_SENT: state.streaming and state.reference is not None and vehicle.armed,
+        ArmFlag.SETPOINTS_SENT: actions.setpoint(s) is not None,
         ArmFlag.FEEDFORWARD: state.phase is Phase.PERCHED and state.offset != ZERO,
         ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
         ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
