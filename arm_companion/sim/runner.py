@@ -90,28 +90,19 @@ async def fly_real_time(
     """
     world = World(config)
     prepare(world)
-    bus = EmulatedBus(world.servos, config.servos)
     flight = Flight(samples=world.samples)
     sim = config.sim
     link = OperatorLink([open_url(sim.operator_autopilot_url), open_url(sim.operator_arm_url)])
-    ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
-    async with _running(
-        world.run,
-        lambda: world.autopilot.run(open_url(sim.autopilot_url), ground),
-        lambda: bus.serve_pty(config.servos.port),
-        link.run,
-    ):
-        await bus.wait_ready()
-        async with _daemon_process(daemon_arguments, log) as daemon:
-            operator = asyncio.create_task(Operator(link, config, flight, say).fly_perch())
-            died = asyncio.create_task(daemon.wait())
-            await asyncio.wait({operator, died}, return_when=asyncio.FIRST_COMPLETED)
-            if not operator.done():
-                operator.cancel()
-                await asyncio.gather(operator, return_exceptions=True)
-                raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
-            died.cancel()
-            failure = operator.result()
+    async with _in_real_time(world, config), _running(link.run), _daemon_process(daemon_arguments, log) as daemon:
+        operator = asyncio.create_task(Operator(link, config, flight, say).fly_perch())
+        died = asyncio.create_task(daemon.wait())
+        await asyncio.wait({operator, died}, return_when=asyncio.FIRST_COMPLETED)
+        if not operator.done():
+            operator.cancel()
+            await asyncio.gather(operator, return_exceptions=True)
+            raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+        died.cancel()
+        failure = operator.result()
     if world.lost_s > 0.0:
         say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
     return Result(flight, failure)
@@ -127,9 +118,23 @@ async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say:
         say: told when it is ready.
         stop: ends it.
     """
-    world = World(config)
-    bus = EmulatedBus(world.servos, config.servos)
     sim = config.sim
+    async with _in_real_time(World(config), config), _daemon_process(daemon_arguments, log) as daemon:
+        say(f"autopilot talks to {sim.operator_autopilot_url}, arm to {sim.operator_arm_url}; Ctrl-C ends")
+        stopped = asyncio.create_task(stop.wait())
+        died = asyncio.create_task(daemon.wait())
+        await asyncio.wait({stopped, died}, return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        if died.done():
+            raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+        died.cancel()
+
+
+@contextlib.asynccontextmanager
+async def _in_real_time(world: World, config: Config) -> AsyncIterator[None]:
+    """The world on its sockets and its pty, ready to be talked to."""
+    sim = config.sim
+    bus = EmulatedBus(world.servos, config.servos)
     ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
     async with _running(
         world.run,
@@ -137,15 +142,7 @@ async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say:
         lambda: bus.serve_pty(config.servos.port),
     ):
         await bus.wait_ready()
-        async with _daemon_process(daemon_arguments, log) as daemon:
-            say(f"autopilot talks to {sim.operator_autopilot_url}, arm to {sim.operator_arm_url}; Ctrl-C ends")
-            stopped = asyncio.create_task(stop.wait())
-            died = asyncio.create_task(daemon.wait())
-            await asyncio.wait({stopped, died}, return_when=asyncio.FIRST_COMPLETED)
-            stopped.cancel()
-            if died.done():
-                raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
-            died.cancel()
+        yield
 
 
 @contextlib.asynccontextmanager
@@ -155,13 +152,18 @@ async def _running(*tasks: Callable[[], Awaitable[None]]) -> AsyncIterator[None]
     async def run(task: Callable[[], Awaitable[None]]) -> None:
         await task()
 
+    failure: ArmError | None = None
     async with asyncio.TaskGroup() as group:
         running = [group.create_task(run(task)) for task in tasks]
         try:
             yield
+        except ArmError as error:  # the block's own failure, which the group would wrap
+            failure = error
         finally:
             for task in running:
                 task.cancel()
+    if failure is not None:
+        raise failure
 
 
 @contextlib.asynccontextmanager

@@ -203,3 +203,18 @@ def test_a_bad_configuration_ends_with_code_78_and_says_what_is_allowed() -> Non
         text = process.stderr.read()
     assert "perch.bar_radius_m" in text
     assert "0.002 to 0.5 m" in text
+
+
+def test_a_daemon_that_ends_early_is_told_in_one_line_and_not_as_a_traceback(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "arm_companion", "sim", "world", "--output", str(tmp_path)]
+    settings = {
+        "links.ground.url": "nonsense:1",
+        "links.autopilot.url": f"udpin:127.0.0.1:{free_port()}",
+        "servos.port": str(tmp_path / "bus"),
+    }
+    for key, value in settings.items():
+        words += ["--set", f"{key}={value}"]
+    ended = subprocess.run(words, capture_output=True, text=True, timeout=30.0, check=False)
+    assert ended.returncode == 1
+    assert "the daemon ended with code 78" in ended.stderr
+    assert "Traceback" not in ended.stderr
