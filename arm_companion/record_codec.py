@@ -6,6 +6,7 @@ import functools
 import json
 import types
 import typing
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -42,17 +43,24 @@ def _hints(cls: Any) -> dict[str, Any]:
 
 def _plain(value: Any) -> Any:
     kind: Any = type(value)
+    return _writer(kind)(value)
+
+
+@functools.cache
+def _writer(kind: Any) -> Callable[[Any], Any]:
+    """What turns a value of exactly this type into what JSON knows; found out once for each type."""
     if kind in (float, int, str, bool, type(None)):
-        return value
-    if isinstance(value, enum.Flag):
-        return value.value
-    if isinstance(value, enum.Enum):
-        return value.name
-    if kind in (tuple, list):
-        return [_plain(item) for item in value]
-    if kind is frozenset:
-        return sorted(_plain(item) for item in value)
-    return {name: _plain(getattr(value, name)) for name in _names(kind)}
+        return lambda value: value
+    if issubclass(kind, enum.Flag):
+        return lambda value: value.value
+    if issubclass(kind, enum.Enum):
+        return lambda value: value.name
+    if issubclass(kind, (tuple, list)):
+        return lambda value: [item if type(item) is float else _plain(item) for item in value]
+    if issubclass(kind, frozenset):
+        return lambda value: sorted(_plain(item) for item in value)
+    names = _names(kind)
+    return lambda value: {name: _plain(getattr(value, name)) for name in names}
 
 
 def _build(hint: Any, value: Any) -> Any:

@@ -10,6 +10,7 @@ in the moving base, is g - a_base - alpha x x - omega x (omega x x); the differe
 over the arm's mass, is the inertial part. So whatever field the solution was found in, nothing counts twice.
 """
 
+import functools
 import math
 from dataclasses import dataclass, field
 
@@ -33,6 +34,7 @@ def _zero() -> Array:
     return np.zeros(3)
 
 
+@functools.cache
 def mount(position: tuple[float, ...], rpy_deg: tuple[float, ...]) -> Pose:
     """T_ba from [mount]: base point in body axes (3,), m, and roll, pitch, yaw of the base axes, deg."""
     roll, pitch, yaw = (math.radians(angle) for angle in rpy_deg)

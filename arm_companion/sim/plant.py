@@ -49,16 +49,18 @@ class Plant:
         for i in range(config.arm.disks + 1):
             body = self._base if i == 0 else model.body(mjcf.link(i)).id
             self._link_of_geom[model.geom_bodyid == body] = i
-        hinges = [i for i in range(model.njnt) if model.joint(i).name.startswith(mjcf.BENDING)]
-        self._bending = np.array(hinges)
-        self._bending_qpos = model.jnt_qposadr[self._bending]
-        self._bending_stiffness = float(model.jnt_stiffness[hinges[0]])
+        # bending and torsion hinges of every link: the torsion is the third, whichever bending axis comes first
+        hinges = [i for i in range(model.njnt) if model.joint(i).name.startswith((mjcf.BENDING, mjcf.TORSION))]
+        first, angle = hinges[0], model.jnt_qposadr[hinges[0]]
+        self._bend = self._data.qpos[angle : angle + len(hinges)].reshape(-1, 3)[:, :2]
+        self._hinge_stiffness = model.jnt_stiffness[first : first + len(hinges)].reshape(-1, 3)[:, :2]
+        self._bending_stiffness = float(self._hinge_stiffness[0, 0])
         self._excess = mjcf.chord_excess(config.arm)
         self._straight_rest = config.arm.length_m - config.arm.tendons.pretension_n / self._stiffness
         # views of MuJoCo's own memory, made once because a step asks for them all
         self._qpos, self._qvel, self._applied = self._data.qpos, self._data.qvel, self._data.qfrc_applied[:6]
         self._lengths, self._rest = self._data.ten_length, model.tendon_lengthspring[:, 1]
-        self._hinge_stiffness = model.jnt_stiffness
+        self._tendon_damping = model.tendon_damping
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
         mujoco.mj_forward(model, self._data)
@@ -149,13 +151,11 @@ class Plant:
         The arcs between the disks are longer than the hinged chain by `chord_excess` for every squared radian of
         a hinge: that goes into the rest length, and its derivative, tension times angle, is a spring in the hinge.
         """
-        lengths, rest = self._lengths, self._rest
-        total = self._stiffness * float(np.maximum(0.0, lengths - rest).sum())
-        bend = self._qpos[self._bending_qpos]
-        self._hinge_stiffness[self._bending] = self._bending_stiffness + 2 * self._excess * total
-        rest[:] = self._straight_rest - self._excess * float(bend @ bend)
-        rest -= pulls
-        self._model.tendon_damping[:] = self._damping * (lengths > rest)
+        lengths, rest, bend = self._lengths, self._rest, self._bend
+        total = self._stiffness * sum(longer for longer in (lengths - rest).tolist() if longer > 0.0)
+        self._hinge_stiffness[:] = self._bending_stiffness + 2 * self._excess * total
+        np.subtract(self._straight_rest - self._excess * float(np.einsum("ij,ij->", bend, bend)), pulls, out=rest)
+        np.multiply(lengths > rest, self._damping, out=self._tendon_damping)
 
     def _measure(self) -> PlantTruth:
         model, data = self._model, self._data

@@ -27,6 +27,16 @@ _FOLLOWING_TICKS = 200
 _MODES = {OperatingMode.POSITION, OperatingMode.EXTENDED_POSITION, OperatingMode.PWM}
 """Velocity mode, which the arm has no use for, is not emulated; nor are drive modes other than 0 (normal
 direction, profiles by velocity)."""
+# What every step of the motion looks up, spelled out once: a servo takes a thousand steps a second.
+_TORQUE_ENABLE, _OPERATING_MODE = ct.TORQUE_ENABLE.address, ct.OPERATING_MODE.address
+_GOAL_PWM, _PWM_LIMIT, _GOAL_POSITION = ct.GOAL_PWM.address, ct.PWM_LIMIT.address, ct.GOAL_POSITION.address
+_PROFILE_VELOCITY, _PROFILE_ACCELERATION = ct.PROFILE_VELOCITY.address, ct.PROFILE_ACCELERATION.address
+_P_GAIN, _I_GAIN, _D_GAIN = ct.POSITION_P_GAIN.address, ct.POSITION_I_GAIN.address, ct.POSITION_D_GAIN.address
+_MIN_VOLTAGE_LIMIT, _MAX_VOLTAGE_LIMIT = ct.MIN_VOLTAGE_LIMIT.address, ct.MAX_VOLTAGE_LIMIT.address
+_TEMPERATURE_LIMIT, _BUS_WATCHDOG = ct.TEMPERATURE_LIMIT.address, ct.BUS_WATCHDOG.address
+_PWM_MODE = int(OperatingMode.PWM)
+_SPEED = ct.VELOCITY_UNIT_RAD_PER_S / ct.TICK_RAD  # ticks/s for each unit of the register
+_ACCELERATION = ct.ACCELERATION_UNIT_RAD_PER_S2 / ct.TICK_RAD  # ticks/s^2
 _GOALS = {ct.GOAL_PWM, ct.GOAL_VELOCITY, ct.GOAL_POSITION}
 
 
@@ -203,14 +213,12 @@ class EmulatedServo:
         """Let `dt` seconds pass under a load (N m on the horn) and a supply voltage."""
         self._clock += dt
         self._voltage = voltage
-        if voltage < BROWN_OUT_V and self._powered:
-            self.set_power(on=False)
-        elif voltage >= BROWN_OUT_V and not self._powered:
-            self.set_power(on=True)
+        if (voltage >= BROWN_OUT_V) != self._powered:
+            self.set_power(on=not self._powered)
         if self._wakes_at is not None and self._clock >= self._wakes_at:
             self._wakes_at = None
             self._boot()
-        on = self.awake and self.values[ct.TORQUE_ENABLE.address] == 1
+        on = self.values[_TORQUE_ENABLE] == 1 and self.awake
         if on:
             self._watch()
             self._control(dt)
@@ -218,28 +226,21 @@ class EmulatedServo:
         self._protect(dt, voltage, on=on)
 
     def _watch(self) -> None:
-        allowed = self.values[ct.BUS_WATCHDOG.address] * ct.WATCHDOG_UNIT_S
+        allowed = self.values[_BUS_WATCHDOG] * ct.WATCHDOG_UNIT_S
         if allowed > 0 and self._clock - self._heard_at > allowed:
-            self.values[ct.BUS_WATCHDOG.address] = ct.WATCHDOG_TRIPPED
+            self.values[_BUS_WATCHDOG] = ct.WATCHDOG_TRIPPED
             self._hold()
 
     def _control(self, dt: float) -> None:
-        v = self.values
-        pwm_limit = min(abs(v[ct.GOAL_PWM.address]), v[ct.PWM_LIMIT.address])
-        if v[ct.OPERATING_MODE.address] == OperatingMode.PWM:
-            self.motor.duty = v[ct.GOAL_PWM.address] / ct.PWM_FULL
+        v, motor, trajectory = self.values, self.motor, self._trajectory
+        goal_pwm = v[_GOAL_PWM]
+        if v[_OPERATING_MODE] == _PWM_MODE:
+            motor.duty = goal_pwm / ct.PWM_FULL
             return
-        self._trajectory.step(
-            v[ct.GOAL_POSITION.address],
-            v[ct.PROFILE_VELOCITY.address] * (ct.VELOCITY_UNIT_RAD_PER_S / ct.TICK_RAD),
-            v[ct.PROFILE_ACCELERATION.address] * (ct.ACCELERATION_UNIT_RAD_PER_S2 / ct.TICK_RAD),
-            dt,
-        )
-        gains = Gains.from_registers(
-            v[ct.POSITION_P_GAIN.address], v[ct.POSITION_I_GAIN.address], v[ct.POSITION_D_GAIN.address]
-        )
-        error = self._trajectory.position - (self.motor.position + self._turns)
-        self.motor.control(error, self._trajectory.speed - self.motor.speed, gains, pwm_limit, dt)
+        trajectory.step(v[_GOAL_POSITION], v[_PROFILE_VELOCITY] * _SPEED, v[_PROFILE_ACCELERATION] * _ACCELERATION, dt)
+        gains = Gains.from_registers(v[_P_GAIN], v[_I_GAIN], v[_D_GAIN])
+        error = trajectory.position - (motor.position + self._turns)
+        motor.control(error, trajectory.speed - motor.speed, gains, min(abs(goal_pwm), v[_PWM_LIMIT]), dt)
 
     def _protect(self, dt: float, voltage: float, *, on: bool) -> None:
         stall = STALL_TORQUE_PER_V * max(voltage, BROWN_OUT_V)
@@ -252,10 +253,10 @@ class EmulatedServo:
         self._strained_s = self._strained_s + dt if abs(self._load) > _OVERLOAD_SHARE else 0.0
         if self._strained_s > _OVERLOAD_S:
             self.trip(HardwareError.OVERLOAD)
-        if self._temperature > self.values[ct.TEMPERATURE_LIMIT.address]:
+        v = self.values
+        if self._temperature > v[_TEMPERATURE_LIMIT]:
             self.trip(HardwareError.OVERHEATING)
-        tenths = voltage / ct.VOLTAGE_UNIT_V
-        if not self.values[ct.MIN_VOLTAGE_LIMIT.address] <= tenths <= self.values[ct.MAX_VOLTAGE_LIMIT.address]:
+        if not v[_MIN_VOLTAGE_LIMIT] <= voltage / ct.VOLTAGE_UNIT_V <= v[_MAX_VOLTAGE_LIMIT]:
             self.trip(HardwareError.INPUT_VOLTAGE)
 
     # Registers.

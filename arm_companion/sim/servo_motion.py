@@ -6,6 +6,7 @@ friction, so that a horn at rest holds a small load even without power. What a c
 gain does under load, it does here too: it sags, and stalls when the duty is exhausted.
 """
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -34,10 +35,11 @@ class Gains:
     i: float
     d: float
 
-    @classmethod
-    def from_registers(cls, p: int, i: int, d: int) -> "Gains":
+    @staticmethod
+    @functools.cache
+    def from_registers(p: int, i: int, d: int) -> "Gains":
         """Gains of the raw register values."""
-        return cls(p / 128, i / 65_536, d / 160)
+        return Gains(p / 128, i / 65_536, d / 160)
 
 
 @dataclass(slots=True)

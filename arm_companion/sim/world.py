@@ -16,7 +16,7 @@ from arm_companion.sim.plant import Plant
 from arm_companion.sim.ports import PlantTruth, RigidState
 from arm_companion.sim.servo_emulator import ServoEmulator
 
-_CONTROL_PERIOD_S = 0.002
+_CONTROL_PERIOD_S = 0.004  # 250 Hz, as PX4 and ArduPilot run their attitude loops and more often than servos answer
 _SAMPLE_EVERY = 10  # control periods
 _MOST_BEHIND_S = 0.1
 _PERIODS_IN_ONE_GO = 2

@@ -19,7 +19,7 @@ class MemoryTransport:
         self._side = side
         self.receiver = receiver
         self.dropped = 0
-        self._arriving: deque[bytes] = deque()
+        self._arriving: deque[tuple[float, bytes]] = deque()
         self._closed = asyncio.Event()
 
     def write(self, data: bytes) -> None:
@@ -37,16 +37,26 @@ class MemoryTransport:
     def arrive(self, data: bytes, latency_s: float) -> None:
         """Take `data` that will have come in `latency_s` seconds.
 
-        Timers that are due at the same instant run in any order; the bytes keep theirs.
+        Timers that are due at the same instant run in any order; the bytes keep theirs. What was written at one
+        instant comes as one chunk.
         """
-        self._arriving.append(data)
-        asyncio.get_running_loop().call_later(latency_s, self._deliver)
+        loop = asyncio.get_running_loop()
+        due = loop.time() + latency_s
+        if not self._arriving:
+            loop.call_at(due, self._deliver)
+        self._arriving.append((due, data))
 
     def _deliver(self) -> None:
-        """Hand the oldest chunk to the receiver unless this end has closed meanwhile."""
-        data = self._arriving.popleft()
+        """Hand what is due to the receiver unless this end has closed meanwhile."""
+        arriving = self._arriving
+        loop = asyncio.get_running_loop()
+        chunk = [arriving.popleft()[1]]
+        while arriving and arriving[0][0] <= loop.time():
+            chunk.append(arriving.popleft()[1])
+        if arriving:
+            loop.call_at(arriving[0][0], self._deliver)
         if not self._closed.is_set():
-            self.receiver(data)
+            self.receiver(b"".join(chunk))
 
     def close(self) -> None:
         """Leave the pipe."""

@@ -183,7 +183,7 @@ def test_what_the_kernel_cannot_take_is_dropped_and_counted() -> None:
 # --- memory ---
 
 
-def test_a_memory_pipe_keeps_the_order_of_what_is_written_at_one_instant() -> None:
+def test_a_memory_pipe_delivers_what_is_written_at_one_instant_in_order_and_at_once() -> None:
     async def main() -> None:
         heard: list[bytes] = []
         pipe = MemoryPipe()
@@ -192,8 +192,10 @@ def test_a_memory_pipe_keeps_the_order_of_what_is_written_at_one_instant() -> No
         sent = [bytes([i]) for i in range(100)]
         for chunk in sent:
             here.write(chunk)
+        await asyncio.sleep(0.5 * pipe.latency_s)
+        here.write(b"later")
         await asyncio.sleep(0.01)
-        assert heard == sent
+        assert heard == [b"".join(sent), b"later"]
         here.close()
         there.close()
 
