@@ -230,6 +230,13 @@ class PerchConfig:
     verify_give_share: float = option(
         "share of that offset which a good grip gives at most", 0.3, lower=0.05, upper=0.95
     )
+    slide_force_n: float = option(
+        "most that a vertical move pushes against a wrap, which slides on its bar rather than stretch; 0 does not push",
+        2.5,
+        unit="N",
+        lower=0.0,
+        upper=50.0,
+    )
     jog_max_m: float = option("largest move of the anchored vehicle", 0.03, unit="m", lower=0.001, upper=0.2)
     contact_timeout_s: float = option("time for the reach", 40.0, unit="s", lower=1.0, upper=300.0)
     state_timeout_s: float = option("time for any other moving state", 30.0, unit="s", lower=1.0, upper=600.0)

@@ -49,7 +49,10 @@ _YAW_RATE = 0.6
 _NEAR_M = 0.15  # from here on the bar may be touched at any moment
 _FAR_FACTOR = 3.0
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
+_REST_S = 5.0
+_AT_REST_M = 0.002
 _LEAN_RATE = 1.0  # m/s^3
+_TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that is still to go
 
 
 def prepare(s: Situation) -> State:
@@ -86,7 +89,8 @@ def prepare(s: Situation) -> State:
                 bend_goal=state.bend,
             )
         case Phase.PERCHED if state.anchor is not None:
-            return dataclasses.replace(state, reference=Reference(state.anchor.position_w, ZERO, state.heading))
+            place = state.anchor.position_w
+            return dataclasses.replace(state, rest=place, reference=Reference(place, ZERO, state.heading))
         case Phase.UNLOAD:
             return dataclasses.replace(state, offset=ZERO, bend_goal=state.bend)
     return state
@@ -98,6 +102,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     Returns:
         Memory, what the servos do, and their goals (m of tendon taken in) when they are driven.
     """
+    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s)))
     state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
@@ -223,7 +228,21 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
         case Phase.VERIFY:
             return add(anchor, scale(s.ahead, -perch.verify_pull_m)), perch.verify_pull_m
         case _:
-            return add(anchor, s.state.offset), _NUDGE_M_PER_S
+            return add(s.rest, s.state.offset), _NUDGE_M_PER_S
+
+
+def _rest(s: Situation) -> Vec3 | None:
+    """Where the anchored vehicle stays by itself, followed slowly while no move is asked for.
+
+    So nothing winds up against the bar while the arm settles and the position's own estimate wanders.
+    """
+    state = s.state
+    moving = state.offset != ZERO or (
+        state.reference is not None and norm(sub(state.reference.position, s.rest)) > _AT_REST_M
+    )
+    if state.phase is not Phase.PERCHED or moving or not s.vehicle_fresh:
+        return state.rest
+    return add(s.rest, scale(sub(state.position, s.rest), s.dt / (_REST_S + s.dt)))
 
 
 def _lean(s: Situation) -> Vec3:
@@ -231,8 +250,24 @@ def _lean(s: Situation) -> Vec3:
     prediction = s.state.prediction
     wanted = ZERO
     if s.state.phase is Phase.PERCHED and prediction is not None:
-        wanted = clip_norm(prediction.lean, s.config.limits.feedforward_m_per_s2)
+        wanted = clip_norm(add(prediction.lean, (0.0, 0.0, _trim(s))), s.config.limits.feedforward_m_per_s2)
     return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), _LEAN_RATE * s.dt))
+
+
+def _trim(s: Situation) -> float:
+    """Downward acceleration that makes a vertical move against a wrap which slides on its bar, m/s^2.
+
+    How hard the bar's friction holds on, no elastic model knows. So the force is found: it grows with the error
+    until the vehicle moves, never beyond `perch.slide_force_n`, and only while a vertical move is asked for.
+    docs/adr/0017 has the margin to instability.
+    """
+    down = s.state.offset[2]
+    if not down or not s.vehicle_fresh:
+        return 0.0
+    error = s.rest[2] + down - s.state.position[2]
+    most = s.config.perch.slide_force_n
+    force = s.state.lean[2] * s.config.vehicle.mass_kg + _TRIM_N_PER_M_S * error * s.dt
+    return min(max(force, -most), most) / s.config.vehicle.mass_kg
 
 
 def _bend_towards(bend: tuple[float, float], goal: tuple[float, float], most: float) -> tuple[float, float]:

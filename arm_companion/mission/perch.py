@@ -217,9 +217,9 @@ def pull_test_passed(s: Situation) -> str | None:
 
 
 def unloaded(s: Situation) -> str | None:
-    """The reference is back at the anchor and nothing is fed forward, so that letting go does not kick."""
-    reference, anchor = s.state.reference, s.state.anchor
-    back = reference is None or anchor is None or arrived(reference, anchor.position_w)
+    """The reference is back where the vehicle rests and nothing is fed forward: letting go does not kick."""
+    reference = s.state.reference
+    back = reference is None or s.state.anchor is None or arrived(reference, s.rest)
     return "unloaded" if s.elapsed > _SETTLE_S and back and s.state.lean == ZERO else None
 
 

@@ -197,6 +197,11 @@ class Situation:
         """Vehicle position when the pull test began."""
         return self.state.anchor.position_w if self.state.anchor else self.facts.vehicle.position_w
 
+    @property
+    def rest(self) -> Vec3:
+        """Vehicle position in which the anchored arm asks for nothing."""
+        return self.probe if self.state.rest is None else self.state.rest
+
     def heading_to_bar(self) -> float:
         """Heading across the bar's axis, on the side on which the vehicle is now, rad."""
         bar = self.bar

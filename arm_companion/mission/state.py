@@ -109,6 +109,7 @@ class State:
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
     position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None
+    rest: Vec3 | None = None  # m, where the anchored vehicle stays by itself; moves are counted from here
     prediction: Prediction | None = None
     lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now
     offset: Vec3 = ZERO  # m, asked move away from the anchor

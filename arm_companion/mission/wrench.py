@@ -138,13 +138,15 @@ def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
     """Model and motion, each axis by its variance: a millimetre is half a newton, but the vehicle feels a tenth.
 
     What the vehicle feels comes from the force observer, north and east. Down, where no sensor tells the thrust
-    and where a wrap slides on its bar rather than stretch, stands the arm's weight, give or take what the bar's
-    friction holds. The bar passes on a moment besides the force that nothing measures; it is only in the sigma.
+    and where a wrap slides on its bar rather than stretch, stands the arm's weight less our own push, give or take
+    what the bar's friction holds. The bar passes on a moment besides the force that nothing measures; it is only
+    in the sigma.
     """
     R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
     model = R_wb @ found.wrench[:3]
     model_variance = R_wb**2 @ found.sigma[:3] ** 2 + np.square(_SLIDE_SIGMA)
-    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY))
+    push = s.config.vehicle.mass_kg * s.state.lean[2]
+    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY - push))
     felt_variance = np.square(_FELT_SIGMA)
     share = felt_variance / (felt_variance + model_variance)
     force = R_wb.T @ (share * model + (1.0 - share) * felt)
@@ -171,7 +173,7 @@ def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:
     reference, anchor = s.state.reference, s.state.anchor
     if s.state.phase is not Phase.PERCHED or reference is None or anchor is None or solution is None:
         return ZERO
-    move = np.asarray(sub(reference.position, anchor.position_w))
+    move = np.asarray(sub(reference.position, s.rest))
     if not move.any():
         return ZERO
     try:

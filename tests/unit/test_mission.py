@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
 
@@ -216,6 +217,30 @@ def test_the_feedforward_leans_the_way_that_the_arm_pulls_back(parameters: Param
     assert 0.2 < north < parameters.config.limits.feedforward_m_per_s2
     assert abs(east) < 0.1 * north
     assert down == 0.0
+
+
+def test_a_vertical_move_pushes_harder_until_the_limit_and_lets_go_when_the_move_ends(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = hovering()
+    held = at(Phase.PERCHED, anchor=ANCHOR, position=ANCHOR.position_w)
+    state, said = run(held, ask(facts, Order.JOG, 3.0, 0.0, 0.0, 0.01), parameters, 20.0)
+    pushes = [c.setpoint.acceleration_w[2] for c in said if c.setpoint is not None]
+    limit = parameters.config.perch.slide_force_n / parameters.config.vehicle.mass_kg
+    assert all(after >= before for before, after in pairwise(pushes))
+    assert pushes[-1] == pytest.approx(limit)
+    state, said = run(state, ask(facts, Order.JOG, 3.0, 0.0, 0.0, 0.0), parameters, 5.0)
+    assert state.lean == (0.0, 0.0, 0.0)
+
+
+def test_moves_start_where_the_anchored_vehicle_came_to_rest(parameters: Parameters, hovering: Hovering) -> None:
+    facts = hovering(position_w=(2.0, 0.0, -2.195))
+    held = at(Phase.PERCHED, anchor=ANCHOR, position=ANCHOR.position_w)
+    state, _ = run(held, facts, parameters, 30.0)
+    assert state.rest == pytest.approx((2.0, 0.0, -2.195), abs=2e-4)
+    state, _ = run(state, ask(facts, Order.JOG, 3.0, 0.0, 0.0, 0.01), parameters, 3.0)
+    assert state.reference is not None
+    assert state.reference.position == pytest.approx((2.0, 0.0, -2.185), abs=2e-4)
 
 
 def test_without_a_model_of_the_grip_nothing_is_fed_forward_and_nothing_is_called_valid(
