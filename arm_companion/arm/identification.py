@@ -16,11 +16,11 @@ import numpy as np
 
 from arm_companion.arm import friction
 from arm_companion.arm.least_squares import levenberg_marquardt, student
-from arm_companion.arm.model import ArmSolution, Payload
+from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import ArmError
-from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
+from arm_companion.geometry.arrays import Array, frozen, sealed
 
 NAMES = ("EI", "k_T", "T0", "mu")
 POSITION, SHIFT, TENSION = "tip position", "tip shift", "tension"
@@ -182,27 +182,6 @@ def fit(
     return _result(problem, solved, before, notes)
 
 
-class _FollowerModel(RodModel):
-    """The rod with a force that turns with the tip besides the dead one; friction knows of dead ones only."""
-
-    follower: Array = sealed(np.zeros(6))
-
-    def free(
-        self,
-        pull: ArrayLike,
-        gravity: ArrayLike,
-        tip_wrench: ArrayLike | None = None,
-        payload: Payload | None = None,
-        *,
-        follower_wrench: ArrayLike | None = None,
-        tension: ArrayLike | None = None,
-        start: ArmSolution | None = None,
-    ) -> ArmSolution:
-        """As `RodModel.free`, under `follower` where no other is given."""
-        turning = self.follower if follower_wrench is None else follower_wrench
-        return super().free(pull, gravity, tip_wrench, payload, follower_wrench=turning, tension=tension, start=start)
-
-
 class _Problem:
     """The test as a function from parameters to what should have been measured."""
 
@@ -239,21 +218,22 @@ class _Problem:
     def predict(self, x: Mapping[str, float]) -> Array:
         """Values (q,) in the order of `measured`."""
         parameters, mu = self.arm(x)
-        model = _FollowerModel(parameters, fast=self.fast)
+        model = RodModel(parameters, fast=self.fast)
         result = np.empty(len(self.places))
         seen: list[ArmSolution] = []
         first: list[ArmSolution] = []
         grip: friction.Grip | None = None
         for i, reading in enumerate(self.test.readings):
             new = i == 0 or self.test.readings[i - 1].run != reading.run
-            load = np.concatenate((reading.force, np.zeros(3)))
-            model.follower = sealed(np.concatenate((reading.follower, np.zeros(3))))
+            load, turning = (np.concatenate((f, np.zeros(3))) for f in (reading.force, reading.follower))
             start = self._starts[i] or (None if new else seen[-1])
             if new or grip is None or mu <= 0:
-                now = model.free(reading.pull, self.test.gravity, load, start=start)
+                now = model.free(reading.pull, self.test.gravity, load, follower_wrench=turning, start=start)
                 grip = friction.Grip.relaxed(now)
             else:
-                now, grip = friction.step(model, mu, grip, reading.pull, self.test.gravity, load, start=start)
+                now, grip = friction.step(
+                    model, mu, grip, reading.pull, self.test.gravity, load, follower_wrench=turning, start=start
+                )
             self._starts[i] = now
             seen.append(now)
             first.append(now if new else first[-1])

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from arm_companion.arm import arc, rod_solver, statics
+from arm_companion.arm import rod_solver, statics
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
 from arm_companion.arm.rod_equations import Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
-from arm_companion.errors import ConfigError, LimitViolated, NoSolution
+from arm_companion.arm.unloaded import UnloadedArm
+from arm_companion.errors import LimitViolated, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
@@ -22,7 +23,7 @@ _NOTHING = Payload(0.0)
 _ZERO = sealed(np.zeros(3))
 
 
-class RodModel:
+class RodModel(UnloadedArm):
     """`ArmModel` by the rod with curvature modes.
 
     Args:
@@ -40,7 +41,7 @@ class RodModel:
     def __init__(
         self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 1e-4, fast: bool = False
     ) -> None:
-        self._parameters = parameters
+        super().__init__(parameters)
         self._tolerance, self._refuse = tolerance, refuse
         self._none = sealed(np.zeros(parameters.n))
         self._slack = sealed(parameters.T0 / parameters.k_T)  # stretch at zero pull
@@ -50,34 +51,6 @@ class RodModel:
             from arm_companion.arm.fast import FastRod  # noqa: PLC0415 - numba is optional, and slow to import
 
             self._make = FastRod
-
-    @property
-    def parameters(self) -> ArmParameters:
-        """The arm."""
-        return self._parameters
-
-    def pull_for_bend(self, bend: ArrayLike, pretension: float | None = None) -> Array:
-        """See `ArmModel.pull_for_bend`."""
-        return statics.pull_for_bend(self._parameters, bend, pretension)
-
-    def pull_for_tension(self, bend: ArrayLike, tension: ArrayLike) -> Array:
-        """See `ArmModel.pull_for_tension`."""
-        return statics.pull_for_tension(self._parameters, bend, tension)
-
-    def bend_for_pull(self, pull: ArrayLike) -> Array:
-        """See `ArmModel.bend_for_pull`."""
-        return statics.bend_for_pull(self._parameters, pull)
-
-    def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
-        """See `ArmModel.bend_for_tip`; an unloaded segment is an arc.
-
-        Raises:
-            ConfigError: for several segments, which reach most points in many ways.
-        """
-        if len(self._parameters.segments) != 1:
-            raise ConfigError("the bend for a tip position is defined for one segment")
-        L = self._parameters.L
-        return arc.bend_for_tip(p_tip_base, L, 0.01 * L if tolerance is None else tolerance)
 
     def free(
         self,
@@ -93,14 +66,8 @@ class RodModel:
         """See `ArmModel.free`.
 
         Args:
-            pull: tendon goals (n,), m.
-            gravity: (3,), m/s^2, base axes.
-            tip_wrench: dead load at the tip (6,) [N; N m], base axes.
-            payload: what the tip carries.
-            follower_wrench: load that turns with the tip (6,) [N; N m], tip axes.
             tension: of each tendon under tension control (n,), N; the motors give way as needed and `pull`
                 does not count.
-            start: a neighbouring solution to start from.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that loading follows.
@@ -129,11 +96,7 @@ class RodModel:
         """See `ArmModel.held`.
 
         Args:
-            pull: tendon goals (n,), m.
-            hold: what is held and where it is now.
-            gravity: (3,), m/s^2, base axes.
             tension: of each tendon under tension control (n,), N; `pull` and `hold.beyond` do not count.
-            start: a neighbouring solution of the same kind of hold.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that leads there.
