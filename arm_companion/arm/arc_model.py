@@ -115,7 +115,7 @@ class ArcModel(UnloadedArm):
 
 @dataclass(frozen=True, eq=False)
 class _Loads:
-    """Dead forces along the arc: (fraction of the length, force (3,)); and tip wrenches (6,), dead and turning along."""
+    """Dead forces along the arc, (fraction of the length, force (3,)), and tip wrenches (6,): dead, turning along."""
 
     points: tuple[tuple[float, Array], ...]
     tip: Array

@@ -31,8 +31,8 @@ class RodModel(UnloadedArm):
         tolerance: imbalance between the modes (`Rod.imbalance`) above which a finer discretisation is taken;
             tip and base wrench are good to about ten times this.
         refuse: imbalance of the finest discretisation above which the answer is refused.
-        fast: whether to use numba (the extra `fast`). Compiling, or reading the compiled code from numba's
-            cache, is done here and now, and never in flight.
+        fast: whether to use numba (the extra `fast`). What `compiled.load` has not loaded yet is loaded, or
+            compiled, here and now, and never in flight.
 
     Raises:
         ImportError: when `fast` is asked for and numba is not installed.
@@ -65,9 +65,8 @@ class RodModel(UnloadedArm):
     ) -> ArmSolution:
         """See `ArmModel.free`.
 
-        Args:
-            tension: of each tendon under tension control (n,), N; the motors give way as needed and `pull`
-                does not count.
+        With `tension` (n,), N, the tendons are under tension control: the motors give way as needed, and `pull`
+        does not count.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that loading follows.
@@ -95,8 +94,7 @@ class RodModel(UnloadedArm):
     ) -> ArmSolution:
         """See `ArmModel.held`.
 
-        Args:
-            tension: of each tendon under tension control (n,), N; `pull` and `hold.beyond` do not count.
+        With `tension` (n,), N, the tendons are under tension control: `pull` and `hold.beyond` do not count.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that leads there.

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from arm_companion.arm import compiled
 from arm_companion.arm.model import ArmSolution, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 from arm_companion.arm.rod_model import RodModel
@@ -38,6 +39,7 @@ _EXPERIMENTS = {
     "stiffness-test": "the paper's stiffness test: five bends, loaded inward and outward",
     "perching": "the paper's perching benchmark: tip held, base moved in x and z and back",
 }
+_LARGEST = 1e9  # of any argument: beyond it lie no arms, and squares overflow
 _TIPS = {"clamped": HoldKind.CLAMPED, "pinned": HoldKind.PINNED}
 
 
@@ -59,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         else:
             _add_case(sub, held=name == "clamp")
         sub.add_argument("--json", action="store_true", help="print one JSON object (SI units)")
+    text = "compile the mechanics into numba's cache, for the daemon to load (extra fast)"
+    commands.add_parser("warm", help=text, description=text[0].upper() + text[1:] + ".")
 
 
 def _add_arm(parser: argparse.ArgumentParser) -> None:
@@ -146,6 +150,8 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Answer; exit code 2 with one line on standard error when it is refused."""
+    if arguments.action == "warm":
+        return _warm()
     config = load_from(arguments)
     try:
         _check(arguments)
@@ -167,12 +173,23 @@ def run(arguments: argparse.Namespace) -> int:
         return 1
 
 
+def _warm() -> int:
+    begun = time.perf_counter()
+    try:
+        place = compiled.load(compiling=True)
+    except compiled.NotCompiled as error:
+        print(f"arm-companion model warm: {error}", file=sys.stderr)
+        return 2
+    print(f"compiled mechanics are in {place}, after {time.perf_counter() - begun:.1f} s")
+    return 0
+
+
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what no case can have."""
     for name, value in vars(arguments).items():
         values = value if isinstance(value, list | tuple) else [value]
-        if any(isinstance(v, float) and not math.isfinite(v) for v in values):
-            raise _RefusedError(f"--{name.replace('_', '-')} takes finite numbers")
+        if any(isinstance(v, float) and not abs(v) <= _LARGEST for v in values):
+            raise _RefusedError(f"--{name.replace('_', '-')} takes finite numbers, up to {_LARGEST:g}")
     if arguments.pretension_n is not None and arguments.pretension_n < 0:
         raise _RefusedError(f"--pretension-n {arguments.pretension_n:g}: tendons cannot push")
     if getattr(arguments, "payload_kg", 0.0) < 0:
