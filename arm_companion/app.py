@@ -78,6 +78,9 @@ class Daemon:
     ) -> None:
         if not any(link.role == "autopilot" for link in config.links.values()):
             raise ConfigError("links: none has the role autopilot")
+        if config.arm.segments:
+            raise ConfigError("arm.segments: the perch is flown by an arm of one segment")
+        config.check_servos()
         self._config = config
         self._clock = clock
         self._manager = manager

@@ -94,6 +94,8 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
         raise _RefusedError("--figure needs 'matplotlib': pip install 'arm-companion[sim]'")
     if arguments.output is not None and arguments.settings:
         raise _RefusedError("--output extends the configuration file: put what --set changes into that file")
+    if config.arm.segments:
+        raise _RefusedError(f"a loading test is fitted for one segment, and this arm has {len(config.arm.chain)}")
     parameters = case.arm(config, Guides(arguments.guides))
     readings = loading_csv.parse(arguments.data.read_text(encoding="utf-8-sig"), RodModel(parameters))
     field = case.field(config, on=arguments.gravity, attitude_deg=arguments.attitude_deg)

@@ -91,9 +91,13 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
 
 def _add_case(parser: argparse.ArgumentParser, *, held: bool) -> None:
     parser.add_argument(
-        "--theta-deg", type=float, metavar="A", help="bend of the unloaded, gravity-free arm (default: 0)"
+        "--theta-deg",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="bend of the unloaded, gravity-free arm; for several segments one each, from base to tip (default: 0)",
     )
-    parser.add_argument("--delta-deg", type=float, metavar="A", help="its bending plane from x (default: 0)")
+    parser.add_argument("--delta-deg", nargs="+", type=float, metavar="A", help="bending planes from x (default: 0)")
     parser.add_argument("--pull-m", nargs="+", type=float, metavar="Q", help="tendon goals instead of a bend")
     if held:
         parser.add_argument(
@@ -158,6 +162,8 @@ def run(arguments: argparse.Namespace) -> int:
         parameters = case.arm(config, Guides(arguments.guides), arguments.pretension_n)
         on = arguments.gravity if arguments.gravity is not None else arguments.attitude_deg is not None
         gravity = case.field(config, on=on, attitude_deg=arguments.attitude_deg)
+        if arguments.action in _EXPERIMENTS and len(parameters.segments) > 1:
+            raise _RefusedError(f"the paper's arm has one segment, this one {len(parameters.segments)}")
         if arguments.action == "stiffness-test":
             return _stiffness_test(arguments, config, parameters, gravity)
         if arguments.action == "perching":
@@ -200,7 +206,13 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _pull(arguments: argparse.Namespace, parameters: ArmParameters) -> Array:
     if arguments.pull_m is None:
-        return case.goals(parameters, arguments.theta_deg or 0.0, arguments.delta_deg or 0.0)
+        theta, delta = (given or [0.0] for given in (arguments.theta_deg, arguments.delta_deg))
+        segments = len(parameters.segments)
+        if max(len(theta), len(delta)) > segments:
+            raise _RefusedError(f"{max(len(theta), len(delta))} bends for {segments} segment{'s' * (segments > 1)}")
+        if len(delta) not in (1, len(theta)):
+            raise _RefusedError(f"--delta-deg has {len(delta)} planes for {len(theta)} bends")
+        return case.goals(parameters, theta, delta)
     if arguments.theta_deg is not None or arguments.delta_deg is not None:
         raise _RefusedError("give a bend or --pull-m, not both")
     if len(arguments.pull_m) != parameters.n:
@@ -223,7 +235,8 @@ def _case(arguments: argparse.Namespace, config: Config, parameters: ArmParamete
         force, moment = arguments.force or nothing, arguments.moment or nothing
         solution = asked.free(force, moment, follower=arguments.follower)
     elapsed = time.perf_counter() - begun
-    answer = _answer(solution, parameters, math.radians(arguments.delta_deg or 0.0), elapsed)
+    delta = math.radians((arguments.delta_deg or [0.0])[0])
+    answer = _answer(solution, parameters, delta, elapsed)
     if arguments.json:
         print(json.dumps(answer))
     else:
@@ -232,7 +245,7 @@ def _case(arguments: argparse.Namespace, config: Config, parameters: ArmParamete
 
 
 def _answer(solution: ArmSolution, parameters: ArmParameters, delta: float, elapsed: float) -> dict[str, Any]:
-    """The command-line contract: every key of it, SI units."""
+    """The command-line contract: every key of it, SI units; K_psi is defined for one segment, null for more."""
     return {
         "tip_position_m": solution.tip_position.tolist(),
         "tip_rotation": solution.tip_rotation.tolist(),
@@ -243,7 +256,7 @@ def _answer(solution: ArmSolution, parameters: ArmParameters, delta: float, elap
         "tip_moment_nm": solution.tip_wrench[3:].tolist(),
         "stiffness_n_per_m": case.stiffness(solution.compliance).tolist(),
         "compliance": solution.compliance.tolist(),
-        "k_psi": case.k_psi(solution, parameters, delta).tolist(),
+        "k_psi": case.k_psi(solution, parameters, delta).tolist() if len(parameters.segments) == 1 else None,
         "converged": True,  # what does not converge is refused
         "residual": solution.residual,
         "solve_time_s": elapsed,
