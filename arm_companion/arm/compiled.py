@@ -49,7 +49,7 @@ def _only_from_cache() -> Any:
     """While it is entered numba compiles nothing: an attempt raises `NotCompiled`."""
     from numba.core import event  # noqa: PLC0415 - see above
 
-    class Refuse(event.Listener):  # type: ignore[misc]
+    class Refuse(event.Listener):
         def on_start(self, _: Any) -> None:
             raise NotCompiled("not in numba's cache: `arm-companion model warm` compiles it")
 

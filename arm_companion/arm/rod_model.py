@@ -31,6 +31,7 @@ class RodModel(UnloadedArm):
         tolerance: imbalance between the modes (`Rod.imbalance`) above which a finer discretisation is taken;
             tip and base wrench are good to about ten times this.
         refuse: imbalance of the finest discretisation above which the answer is refused.
+        levels: the discretisations, coarse to fine, as `LEVELS`.
         fast: whether to use numba (the extra `fast`). What `compiled.load` has not loaded yet is loaded, or
             compiled, here and now, and never in flight.
 
@@ -39,10 +40,16 @@ class RodModel(UnloadedArm):
     """
 
     def __init__(
-        self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 1e-4, fast: bool = False
+        self,
+        parameters: ArmParameters,
+        *,
+        tolerance: float = 3e-6,
+        refuse: float = 1e-4,
+        levels: tuple[tuple[int, int, int], ...] = LEVELS,
+        fast: bool = False,
     ) -> None:
         super().__init__(parameters)
-        self._tolerance, self._refuse = tolerance, refuse
+        self._tolerance, self._refuse, self._levels = tolerance, refuse, levels
         self._none = sealed(np.zeros(parameters.n))
         self._slack = sealed(parameters.T0 / parameters.k_T)  # stretch at zero pull
         self._rods: dict[tuple[float, int], Rod] = {}
@@ -155,7 +162,7 @@ class RodModel(UnloadedArm):
         if rod is None:
             if len(self._rods) >= 64:  # a hold that wanders along the arm must not fill the memory
                 self._rods.clear()
-            rod = self._rods[key] = self._make(self._parameters, s, *LEVELS[level])
+            rod = self._rods[key] = self._make(self._parameters, s, *self._levels[level])
         return rod
 
     def _solve(self, s: float, goal: Problem, payload: Payload, beyond: Array, start: ArmSolution | None) -> RodDetail:
@@ -164,7 +171,7 @@ class RodModel(UnloadedArm):
         while True:
             rod = self._rod(s, level)
             imbalance = rod.imbalance(solved.state) if solved.imbalance is None else solved.imbalance
-            if imbalance <= self._tolerance or level + 1 == len(LEVELS):
+            if imbalance <= self._tolerance or level + 1 == len(self._levels):
                 break
             level += 1
             solved = self._refined(rod, self._rod(s, level), goal, solved, imbalance)
@@ -195,7 +202,7 @@ class RodModel(UnloadedArm):
         if not isinstance(detail, RodDetail) or detail.rod.s != s or not _same_kind(detail.solved.problem, goal):
             detail = None
         lowest = 0 if detail is None else max(0, detail.level - detail.easy)
-        for level in range(lowest, len(LEVELS)):
+        for level in range(lowest, len(self._levels)):
             rod = self._rod(s, level)
             try:
                 if detail is None:
@@ -205,7 +212,7 @@ class RodModel(UnloadedArm):
                     begin = _at(rod, begin.problem, _padded(begin.c, detail.rod, rod), begin.wrench)
                 return level, rod_solver.follow(rod, begin, goal, "from the solution given")
             except NoSolution:
-                if level + 1 == len(LEVELS):
+                if level + 1 == len(self._levels):
                     raise
         raise NoSolution(math.inf, "no discretisation")
 
