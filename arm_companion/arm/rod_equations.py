@@ -16,7 +16,7 @@ Tendon i runs at r (cos phi_i, sin phi_i) off the backbone; its path is the inte
 included: twist stretches every tendon, and tension stiffens the arm against it (by a third in the reference arm).
 
 The cost here is that of calling NumPy some hundred times, so the code stacks what can be stacked. "Wrapped" arrays
-hold components x, y, z, x, y, ... along one axis: the vector product is then a[1:] b[2:] - a[2:] b[1:], and two shorter.
+hold components x, y, z, x, y, ... along one axis: the vector product, two shorter, is then a[1:] b[2:] - a[2:] b[1:].
 """
 
 from dataclasses import dataclass, field

@@ -113,7 +113,7 @@ def defects(asked: Asked, solution: ArmSolution) -> Defects:
 
 
 def _integrated(P, k, segment, tension, R, p, n, m, g, h):
-    """All pieces of a segment at once by the classical method of Runge and Kutta; frames, places and moments at ends."""
+    """Frames, places and moments at the ends of all pieces of a segment, by the classical Runge and Kutta method."""
     here = P.runs[:, k] > 0
     tau, angle = tension[here], P.angles[here]
     offsets = segment.r * np.column_stack((np.cos(angle), np.sin(angle), np.zeros(angle.size)))
