@@ -107,7 +107,7 @@ def is_rotation(R: Array, tolerance: float) -> bool:
         abs(a * c + d * f + g * i),
         abs(b * c + e * f + h * i),
     )
-    return off <= tolerance and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0
+    return bool(off <= tolerance and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0)
 
 
 def from_rpy(roll: float, pitch: float, yaw: float) -> Array:

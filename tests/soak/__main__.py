@@ -129,12 +129,12 @@ def main() -> int:
         judge(case, model, tally)
         if tally.cases % 1000 == 0:
             sys.stderr.write(f"{tally.cases} cases, {tally.solved} solved, {len(tally.wrong)} wrong\n")
+    again = f"{tally.compared} with sharp bends were solved again with more modes"
     lines = [
         f"{tally.cases} cases, {tally.solved} solved in {1e3 * tally.seconds / max(tally.cases, 1):.1f} ms a case",
         *(f"{count:6d} refused: {text}" for text, count in tally.refused.most_common()),
         f"worst defect of loads and supports: {tally.worst:.1e}",
-        f"{tally.compared} with sharp bends were solved again with more modes: wrench and tensions off by at most "
-        f"{100 * tally.off:.2g} %; {tally.unconfirmed} not confirmed so",
+        f"{again}: wrench and tensions off by at most {100 * tally.off:.2g} %, {tally.unconfirmed} not confirmed so",
         f"wrong and silent: {len(tally.wrong)}",
         *tally.wrong,
     ]

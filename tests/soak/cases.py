@@ -35,7 +35,7 @@ class Case:
 
 
 def arm(rng: np.random.Generator) -> ArmParameters:
-    """Any length, radius, stiffness, mass, guides and pretension; three to six tendons to each of up to two segments."""
+    """Any length, radius, stiffness, mass and pretension; three to six tendons to each of up to two segments."""
     guides = Guides.DISKS if rng.random() < 0.5 else Guides.CONTINUOUS
     segments, tendons = [], []
     EI, r = 10 ** rng.uniform(-2.5, -0.7), rng.uniform(0.006, 0.03)
