@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup demo test scenarios check bench format clean
+.PHONY: help setup demo test scenarios soak check bench format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -28,6 +28,9 @@ test: $(STAMP)  ## run the tests
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
 	@$(BIN)/python -m pytest -m scenario
+
+soak: $(STAMP)  ## ask the mechanics 10,000 random questions, none to be answered wrong and silent (ten minutes)
+	@$(BIN)/python -m tests.soak
 
 check: $(STAMP)  ## lint, format, types and dependency directions
 	@$(BIN)/ruff check .

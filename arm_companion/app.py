@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from arm_companion.arm import compiled
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import Clock, Tick, ticks
@@ -32,6 +33,7 @@ from arm_companion.transport.urls import open_url
 log = logging.getLogger(__name__)
 
 _REARM_EVERY_S = 1.0
+_HEARTBEAT_FIRST_S = 0.1  # importing numba leaves the loop little time
 _LEVELS = {
     Severity.CRITICAL: logging.CRITICAL,
     Severity.ERROR: logging.ERROR,
@@ -71,13 +73,19 @@ class Daemon:
         clock: Clock,
         manager: ServiceManager,
         recorder: Recorder | None = None,
+        *,
+        compiled_model: bool = False,
     ) -> None:
         if not any(link.role == "autopilot" for link in config.links.values()):
             raise ConfigError("links: none has the role autopilot")
+        if config.arm.segments:
+            raise ConfigError("arm.segments: the perch is flown by an arm of one segment")
+        config.check_servos()
         self._config = config
         self._clock = clock
         self._manager = manager
         self._recorder = _recorder(config, clock) if recorder is None else recorder
+        self._compiled_model = compiled_model
         self._parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
         self._links = [
             MavlinkLink(name, link.role, openers.links[name], config.vehicle) for name, link in config.links.items()
@@ -124,7 +132,30 @@ class Daemon:
                     link.close()
                 self._recorder.close()
 
+    async def _prepare_model(self) -> None:
+        """The compiled mechanics from numba's cache, where there are any; links and heartbeats run meanwhile.
+
+        Before the first cycle: a model that changed between two cycles would spoil the record's replay.
+        """
+        await asyncio.sleep(_HEARTBEAT_FIRST_S)
+        model = self._parameters.model
+
+        def load() -> RodModel:
+            compiled.load(compiling=False)
+            fast = RodModel(model.parameters, fast=True)
+            fast.free(model.parameters.T0 * 0.0, (0.0, 0.0, 0.0))  # builds its tables
+            return fast
+
+        try:
+            self._parameters = dataclasses.replace(self._parameters, model=await asyncio.to_thread(load))
+        except compiled.NotCompiled as reason:
+            log.log(logging.WARNING if compiled.installed() else logging.INFO, "mechanics on NumPy: %s", reason)
+        else:
+            log.info("mechanics compiled by numba")
+
     async def _cycles(self) -> None:
+        if self._compiled_model:
+            await self._prepare_model()
         self._manager.ready()
         async for tick in ticks(1.0 / self._config.rates.cycle_hz):
             self.missed += tick.missed

@@ -13,6 +13,7 @@ import numpy as np
 from arm_companion.arm import arc, statics, stiffness
 from arm_companion.arm.model import ArmSolution, Derivatives, Hold, MassMoments, Payload
 from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.unloaded import UnloadedArm
 from arm_companion.errors import ConfigError, LimitViolated, NoSolution
 from arm_companion.geometry import so3, wrench
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
@@ -27,7 +28,7 @@ _STEP = 1e-6
 _Solve = Callable[[ArmParameters, Array], ArmSolution]
 
 
-class ArcModel:
+class ArcModel(UnloadedArm):
     """`ArmModel` by the arc; one segment only.
 
     Raises:
@@ -37,29 +38,7 @@ class ArcModel:
     def __init__(self, parameters: ArmParameters) -> None:
         if len(parameters.segments) != 1:
             raise ConfigError("the arc model has one segment")
-        self._parameters = parameters
-
-    @property
-    def parameters(self) -> ArmParameters:
-        """The arm."""
-        return self._parameters
-
-    def pull_for_bend(self, bend: ArrayLike, pretension: float | None = None) -> Array:
-        """See `ArmModel.pull_for_bend`."""
-        return statics.pull_for_bend(self._parameters, bend, pretension)
-
-    def pull_for_tension(self, bend: ArrayLike, tension: ArrayLike) -> Array:
-        """See `ArmModel.pull_for_tension`."""
-        return statics.pull_for_tension(self._parameters, bend, tension)
-
-    def bend_for_pull(self, pull: ArrayLike) -> Array:
-        """See `ArmModel.bend_for_pull`."""
-        return statics.bend_for_pull(self._parameters, pull)
-
-    def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
-        """See `ArmModel.bend_for_tip`."""
-        L = self._parameters.L
-        return arc.bend_for_tip(p_tip_base, L, 0.01 * L if tolerance is None else tolerance)
+        super().__init__(parameters)
 
     def free(
         self,
@@ -68,6 +47,7 @@ class ArcModel:
         tip_wrench: ArrayLike | None = None,
         payload: Payload | None = None,
         *,
+        follower_wrench: ArrayLike | None = None,
         start: ArmSolution | None = None,
     ) -> ArmSolution:
         """See `ArmModel.free`; a payload counts as a point at the tip."""
@@ -75,14 +55,17 @@ class ArcModel:
         q = frozen(pull, (P.n,), "pull")
         g = frozen(gravity, (3,), "gravity")
         w = frozen(np.zeros(6) if tip_wrench is None else tip_wrench, (6,), "tip_wrench")
+        turning = frozen(np.zeros(6) if follower_wrench is None else follower_wrench, (6,), "follower_wrench")
         end_mass = P.segments[0].end_mass + (0.0 if payload is None else payload.mass)
-        u, residual, iterations = _equilibrium(P, q, _Loads.of(P, g, w, end_mass), start)
+        loads = _Loads.of(P, g, w, end_mass, turning)
+        u, residual, iterations = _equilibrium(P, q, loads, start)
 
         def solve(changed: ArmParameters, x: Array) -> ArmSolution:
             n = changed.n
-            return ArcModel(changed).free(x[:n], x[n : n + 3], x[n + 3 :], payload)
+            return ArcModel(changed).free(x[:n], x[n : n + 3], x[n + 3 :], payload, follower_wrench=turning)
 
-        detail = _Detail(P, u, end_mass, np.zeros(P.n), w, solve, np.concatenate((q, g, w)), held=False)
+        point = np.concatenate((q, g, w))
+        detail = _Detail(P, u, loads, np.zeros(P.n), loads.at_tip(u), solve, point, held=False)
         tip, R = arc.tip_position(u, P.L), arc.tip_rotation(u)
         tension = statics.stretch_tension(P, u, q)
         return _solution(detail, q, g, tip, R, tension, residual, iterations, float("nan"))
@@ -102,7 +85,8 @@ class ArcModel:
         P = self._parameters.up_to(s)
         beyond = np.zeros(P.n) if hold.beyond is None else hold.beyond
         end_mass = P.segments[0].end_mass
-        u, _, iterations = _equilibrium(P, q - beyond, _Loads.of(P, g, np.zeros(6), end_mass), start)
+        loads = _Loads.of(P, g, np.zeros(6), end_mass)
+        u, _, iterations = _equilibrium(P, q - beyond, loads, start)
         J = arc.jacobian(u, s)[:3]
         away = target - arc.tip_position(u, s)
         give = np.linalg.lstsq(J, away, rcond=None)[0]
@@ -115,7 +99,7 @@ class ArcModel:
             return ArcModel(changed).held(x[:n], moved, x[n : n + 3])
 
         point = np.concatenate((q, g, np.zeros(6)))
-        detail = _Detail(P, u, end_mass, beyond, push, solve, point, held=True, whole=self._parameters)
+        detail = _Detail(P, u, replace(loads, tip=push), beyond, push, solve, point, held=True, whole=self._parameters)
         residual = float(np.abs(away - J @ give).max()) / s
         tension = statics.stretch_tension(P, u + give, q - beyond)
         return _solution(detail, q, g, target, hold.pose.rotation, tension, residual, iterations, s - reach)
@@ -131,16 +115,25 @@ class ArcModel:
 
 @dataclass(frozen=True, eq=False)
 class _Loads:
-    """Dead forces along the arc: (fraction of the length, force (3,)), and a tip wrench (6,)."""
+    """Dead forces along the arc, (fraction of the length, force (3,)), and tip wrenches (6,): dead, turning along."""
 
     points: tuple[tuple[float, Array], ...]
     tip: Array
+    follower: Array
+    end_mass: float
 
     @classmethod
-    def of(cls, P: ArmParameters, gravity: Array, tip: Array, end_mass: float) -> "_Loads":
+    def of(
+        cls, P: ArmParameters, gravity: Array, tip: Array, end_mass: float, follower: Array | None = None
+    ) -> "_Loads":
         spread = P.segments[0].line_mass * P.L
         points = [(float(x), float(w) * spread * gravity) for x, w in zip(_SIGMA, _SHARE, strict=True)]
-        return cls((*points, (1.0, end_mass * gravity)), tip)
+        return cls((*points, (1.0, end_mass * gravity)), tip, np.zeros(6) if follower is None else follower, end_mass)
+
+    def at_tip(self, u: Array) -> Array:
+        """The whole tip wrench (6,), base axes."""
+        R = arc.tip_rotation(u)
+        return sealed(self.tip + np.concatenate((R @ self.follower[:3], R @ self.follower[3:])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +142,7 @@ class _Detail:
 
     P: ArmParameters
     u: Array
-    end_mass: float
+    loads: _Loads
     beyond: Array
     tip_wrench: Array
     solve: _Solve
@@ -161,7 +154,7 @@ class _Detail:
         """See `Detail.moments`."""
         L = self.P.L
         points = np.array([arc.tip_position(x * self.u, x * L) for x in (*_SIGMA, 1.0)])
-        return MassMoments.of_points(np.append(_SHARE * self.P.segments[0].line_mass * L, self.end_mass), points)
+        return MassMoments.of_points(np.append(_SHARE * self.P.segments[0].line_mass * L, self.loads.end_mass), points)
 
     def sections(self, at: Array) -> tuple[Array, Array]:
         """See `Detail.sections`."""
@@ -176,6 +169,10 @@ class _Detail:
         rest = 1 - s / self.P.L
         return np.asarray(self.beyond + rest * (self.P.H @ self.u + self.P.chord_loss @ (self.u * self.u)))
 
+    def turning(self) -> float:
+        """See `Detail.turning`."""
+        return float(np.hypot(*self.u))
+
     def derivatives(self) -> Derivatives:
         """See `Detail.derivatives`."""
         P = self.whole or self.P
@@ -187,9 +184,7 @@ class _Detail:
         for name in ("EI", "GJ", "k_T", "T0"):
             up, down = P.scaled(**{name: 1 + _STEP}), P.scaled(**{name: 1 - _STEP})
             relative[name] = sealed(self._difference((up, self.point), (down, self.point))[:6])
-        g = self.point[n : n + 3]
-        loads = _Loads.of(self.P, g, self.tip_wrench, self.end_mass)
-        _, K = _force_and_stiffness(self.P, self.u, self.point[:n] - self.beyond, loads)
+        _, K = _force_and_stiffness(self.P, self.u, self.point[:n] - self.beyond, self.loads)
         J = arc.jacobian(self.u, self.P.L)
         return Derivatives(
             pull=sealed(D[:6, :n].copy()),
@@ -262,8 +257,11 @@ def _equilibrium(P: ArmParameters, pull: Array, loads: _Loads, start: ArmSolutio
 def _force_and_stiffness(P: ArmParameters, u: Array, pull: Array, loads: _Loads) -> tuple[Array, Array]:
     """Unbalanced generalised force (2,) and its derivative (2, 2) at the bend u."""
     tau = statics.stretch_tension(P, u, pull)
-    g = statics.bending_moment(P, u, tau) - arc.jacobian(u, P.L).T @ loads.tip
-    K = stiffness.bend_stiffness(P, u, tau, loads.tip)
+    J, w = arc.jacobian(u, P.L), loads.at_tip(u)
+    g = statics.bending_moment(P, u, tau) - J.T @ w
+    turning = w - loads.tip  # the follower, which a turn of the tip takes along
+    K = stiffness.bend_stiffness(P, u, tau, w) + J[:3].T @ so3.hat(turning[:3]) @ J[3:]
+    K = K + J[3:].T @ so3.hat(turning[3:]) @ J[3:]
     for x, force in loads.points:
         w = np.concatenate((force, np.zeros(3)))
         g = g - x * (arc.jacobian(x * u, x * P.L).T @ w)

@@ -12,6 +12,7 @@ from numba import njit
 from numba.core.types import Tuple, boolean, float64, int64
 
 from arm_companion.arm.fast_equations import JIT, STATE, TABLES, Evaluated, M, Tables, V, evaluate, tangent, turned
+from arm_companion.arm.rod_solver import INDIFFERENT
 from arm_companion.geometry.arrays import Array
 
 FREE, PINNED, BAR, CLAMPED = 0, 1, 2, 3
@@ -133,6 +134,7 @@ def is_stable(K: Array, C: Array, scale: Array) -> bool:
                 by = _STIFFEN * scale[0] / (scale[1] * scale[1] if i < 3 else 1.0)
                 total += by * C[a, i] * C[b, i]
             A[a, b] = total
+        A[a, a] -= INDIFFERENT * scale[0]
     return is_positive(A)
 
 

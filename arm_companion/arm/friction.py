@@ -50,15 +50,6 @@ def loss(mu: float, turn: float) -> float:
     return 0.5 * x * (1 - x / 3 * (1 - x / 4)) if x < 1e-3 else 1 + math.expm1(-x) / x
 
 
-def turning(solution: ArmSolution, points: int = 33) -> float:
-    """Angle through which the backbone turns from base to tip, rad, there and back counted twice."""
-    rotation, _ = solution.detail.sections(np.linspace(0.0, solution.arc_length, points))
-    t = rotation[:, :, 2]
-    cosine = np.clip((t[1:] * t[:-1]).sum(axis=1), -1.0, 1.0)
-    sine = np.sqrt((np.cross(t[1:], t[:-1]) ** 2).sum(axis=1))
-    return float(np.arctan2(sine, cosine).sum())
-
-
 def step(
     model: ArmModel,
     mu: float,
@@ -68,6 +59,7 @@ def step(
     tip_wrench: ArrayLike | None = None,
     payload: Payload | None = None,
     *,
+    follower_wrench: ArrayLike | None = None,
     start: ArmSolution | None = None,
 ) -> tuple[ArmSolution, Grip]:
     """Equilibrium of a free tip with friction, coming from what the guides remember.
@@ -82,6 +74,7 @@ def step(
         gravity: (3,), m/s^2, base axes.
         tip_wrench: dead load at the tip (6,), base axes.
         payload: what the tip carries.
+        follower_wrench: load that turns with the tip (6,), tip axes.
         start: a neighbouring solution.
 
     Raises:
@@ -90,12 +83,16 @@ def step(
     """
     P = model.parameters
     q = frozen(pull, (P.n,), "pull")
-    solution = start or model.free(q, gravity, tip_wrench, payload)
+
+    def equilibrium(goals: Array, near: ArmSolution | None) -> ArmSolution:
+        return model.free(goals, gravity, tip_wrench, payload, follower_wrench=follower_wrench, start=near)
+
+    solution = start or equilibrium(q, None)
     z, reach = before.z, _reach(P, mu, q, solution)
     for _ in range(_ITERATIONS):
         # The arm sees tau (1 - z Phi), as if z tau Phi / k_T less had been pulled in.
         drag = z * reach
-        solution = model.free(q - drag, gravity, tip_wrench, payload, start=solution)
+        solution = equilibrium(q - drag, solution)
         path, reach = -solution.detail.path_beyond(0.0), _reach(P, mu, q, solution)
         wish = before.z - (path - before.path) / reach
         target = np.clip(wish, -1.0, 1.0)
@@ -112,7 +109,7 @@ def step(
 def _reach(P: ArmParameters, mu: float, pull: Array, solution: ArmSolution) -> Array:
     """tau Phi / k_T (n,), m: what a tendon stretches, either way, before it slides through this solution's bend."""
     stretch = P.T0 / P.k_T + pull - solution.detail.path_beyond(0.0)
-    return np.maximum(loss(mu, turning(solution)) * np.maximum(stretch, 0.0), _LEAST_REACH)
+    return np.maximum(loss(mu, solution.detail.turning()) * np.maximum(stretch, 0.0), _LEAST_REACH)
 
 
 def _give(P: ArmParameters, tension: Array) -> Array:

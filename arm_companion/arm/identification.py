@@ -9,18 +9,18 @@ parameter whose interval would be wider than it is worth stays as configured, an
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from arm_companion.arm import friction
 from arm_companion.arm.least_squares import levenberg_marquardt, student
-from arm_companion.arm.model import ArmSolution, Payload
+from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
-from arm_companion.errors import ArmError
-from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
+from arm_companion.errors import ArmError, ModelError
+from arm_companion.geometry.arrays import Array, frozen, sealed
 
 NAMES = ("EI", "k_T", "T0", "mu")
 POSITION, SHIFT, TENSION = "tip position", "tip shift", "tension"
@@ -34,7 +34,9 @@ _FACTOR = math.log(20)  # by which a parameter may leave its configured value
 _MU_MAX = 2.0
 _USELESS = 0.5  # one sigma, relative, above which a parameter is not told by the test
 _MU_USELESS = 0.2
+_HOPELESS = 0.05  # scatter about the fit, of the length, at which the model does not describe the data
 _CONFIDENCE = 0.95
+_SUSPECTS = "check units, signs and axes of loads and readings"
 
 
 class NotIdentifiable(ArmError):
@@ -153,8 +155,8 @@ def fit(
         fast: use compiled equations (extra `fast`).
 
     Raises:
-        NotIdentifiable: when there are fewer measurements than parameters, or they tell nothing.
-        ModelError: when the configured arm cannot be solved under the test's loads.
+        NotIdentifiable: when there are fewer measurements than parameters, when they tell nothing, or when model
+            and data contradict each other.
     """
     asked = [name for name in NAMES if name in names]
     if unknown := set(names) - set(NAMES):
@@ -164,12 +166,15 @@ def fit(
     problem = _Problem(parameters, test, mu, fast)
     if len(problem.measured) <= len(asked):
         raise NotIdentifiable(f"{len(problem.measured)} measured values for {len(asked)} parameters")
-    before = problem.scatter(problem.predict({}), 0)
+    try:
+        before = problem.scatter(problem.predict({}), 0)
+    except ModelError as error:
+        raise NotIdentifiable(f"{error}, with the arm as configured: {_SUSPECTS}") from error
     notes: list[str] = []
     x = {name: (0.1 if name == "mu" and mu == 0 else problem.begin(name)) for name in asked}
     # First without what even a perfect measurement would not tell, then without what this one does not.
     for judge in (problem.at, problem.fitted):
-        solved = judge(x)
+        solved = _judged(judge, x)
         while hopeless := _worst(solved.x, solved.covariance):
             name, sigma = hopeless
             share = f"{sigma:.2g}" if name == "mu" else f"{min(100 * sigma, 999):.0f} %"
@@ -177,30 +182,28 @@ def fit(
             x = {other: value for other, value in solved.x.items() if other != name}
             if not x:
                 raise NotIdentifiable("the test tells nothing of " + ", ".join(asked))
-            solved = judge(x)
+            solved = _judged(judge, x)
         x = solved.x
+    _check(problem, solved)
     return _result(problem, solved, before, notes)
 
 
-class _FollowerModel(RodModel):
-    """The rod with a force that turns with the tip besides the dead one; friction knows of dead ones only."""
+def _judged(judge: Callable[[Mapping[str, float]], "_Solved"], x: Mapping[str, float]) -> "_Solved":
+    try:
+        return judge(x)
+    except ModelError as error:
+        raise NotIdentifiable(f"data and model contradict each other ({error}): {_SUSPECTS}") from error
 
-    follower: Array = sealed(np.zeros(6))
 
-    def free(
-        self,
-        pull: ArrayLike,
-        gravity: ArrayLike,
-        tip_wrench: ArrayLike | None = None,
-        payload: Payload | None = None,
-        *,
-        follower_wrench: ArrayLike | None = None,
-        tension: ArrayLike | None = None,
-        start: ArmSolution | None = None,
-    ) -> ArmSolution:
-        """As `RodModel.free`, under `follower` where no other is given."""
-        turning = self.follower if follower_wrench is None else follower_wrench
-        return super().free(pull, gravity, tip_wrench, payload, follower_wrench=turning, tension=tension, start=start)
+def _check(problem: "_Problem", solved: "_Solved") -> None:
+    """Refuse a fit that ended where no arm is, or that does not describe its data."""
+    for name, value in solved.x.items():
+        if (name == "mu" and value >= _MU_MAX) or (name != "mu" and abs(value) >= 0.999 * _FACTOR):
+            raise NotIdentifiable(f"the fit drives {name} out of all bounds: {_SUSPECTS}")
+    for kind in (POSITION, SHIFT):
+        off = solved.scatter.get(kind, 0.0)
+        if off > _HOPELESS * problem.parameters.L:
+            raise NotIdentifiable(f"after the fit the {kind} is still off by {1e3 * off:.0f} mm: {_SUSPECTS}")
 
 
 class _Problem:
@@ -239,21 +242,25 @@ class _Problem:
     def predict(self, x: Mapping[str, float]) -> Array:
         """Values (q,) in the order of `measured`."""
         parameters, mu = self.arm(x)
-        model = _FollowerModel(parameters, fast=self.fast)
+        model = RodModel(parameters, fast=self.fast)
         result = np.empty(len(self.places))
         seen: list[ArmSolution] = []
         first: list[ArmSolution] = []
         grip: friction.Grip | None = None
         for i, reading in enumerate(self.test.readings):
             new = i == 0 or self.test.readings[i - 1].run != reading.run
-            load = np.concatenate((reading.force, np.zeros(3)))
-            model.follower = sealed(np.concatenate((reading.follower, np.zeros(3))))
+            load, turning = (np.concatenate((f, np.zeros(3))) for f in (reading.force, reading.follower))
             start = self._starts[i] or (None if new else seen[-1])
-            if new or grip is None or mu <= 0:
-                now = model.free(reading.pull, self.test.gravity, load, start=start)
-                grip = friction.Grip.relaxed(now)
-            else:
-                now, grip = friction.step(model, mu, grip, reading.pull, self.test.gravity, load, start=start)
+            try:
+                if new or grip is None or mu <= 0:
+                    now = model.free(reading.pull, self.test.gravity, load, follower_wrench=turning, start=start)
+                    grip = friction.Grip.relaxed(now)
+                else:
+                    now, grip = friction.step(
+                        model, mu, grip, reading.pull, self.test.gravity, load, follower_wrench=turning, start=start
+                    )
+            except ModelError as error:
+                raise ModelError(f"reading {i + 1}, run {reading.run!r}: {error}") from error
             self._starts[i] = now
             seen.append(now)
             first.append(now if new else first[-1])

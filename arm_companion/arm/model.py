@@ -172,6 +172,9 @@ class Detail(Protocol):
     def path_beyond(self, s: float) -> Array:
         """How much the arm beyond arc length s shortens each tendon's path (n,), m."""
 
+    def turning(self) -> float:
+        """Angle through which the modelled part bends from base to end, rad; there and back counts twice."""
+
     def derivatives(self) -> Derivatives:
         """Sensitivities of the base wrench.
 
@@ -317,6 +320,7 @@ class ArmModel(Protocol):
         tip_wrench: ArrayLike | None = None,
         payload: Payload | None = None,
         *,
+        follower_wrench: ArrayLike | None = None,
         start: ArmSolution | None = None,
     ) -> ArmSolution:
         """Equilibrium with a free tip, motors locked.
@@ -326,6 +330,7 @@ class ArmModel(Protocol):
             gravity: (3,), m/s^2, base axes.
             tip_wrench: dead load at the tip (6,) [N; N m], base axes; none when None.
             payload: what the tip carries.
+            follower_wrench: load that turns with the tip (6,) [N; N m], tip axes.
             start: a neighbouring solution to start from.
 
         Raises:

@@ -96,29 +96,33 @@ class ArmParameters:
 
     @classmethod
     def of(cls, config: "ArmConfig", guides: Guides = Guides.DISKS) -> "ArmParameters":
-        """From the configuration's [arm] section (one segment).
+        """From the configuration's [arm] section and the [[arm.segments]] beyond it.
 
-        Backbone, tendons and spacer disks are spread evenly over the length; the end disk is a point mass.
-        A tendon's stiffness is E A over the length from pulley to end disk, with the servo's in series.
+        Backbone, tendons and spacer disks are spread evenly over each segment's length; its end disk is a point
+        mass. A tendon's stiffness is E A over the length from pulley to end disk, with the servo's in series.
         """
-        L, rod, cable, mass = config.length_m, config.backbone, config.tendons, config.mass
-        I_p = math.pi * rod.diameter_m**4 / 64
-        EI = rod.youngs_modulus_pa * I_p
-        backbone_kg = mass.backbone_density_kg_m3 * math.pi * rod.diameter_m**2 / 4 * L
-        spread_kg = backbone_kg + mass.tendons_kg + (config.disks - 1) * mass.disk_kg
-        segment = Segment(
-            L=L,
-            r=config.pitch_radius_m,
-            disks=config.disks,
-            EI=EI,
-            GJ=EI / (1 + rod.poisson_ratio),  # G = E / 2(1 + nu), J = 2 I for a round rod
-            line_mass=spread_kg / L,
-            end_mass=mass.end_disk_kg,
-        )
-        EA_T = cable.youngs_modulus_pa * math.pi * cable.diameter_m**2 / 4
-        k_T = 1 / ((L + cable.routing_length_m) / EA_T + 1 / cable.servo_stiffness_n_per_m)
-        tendons = tuple(Tendon(math.radians(angle), k_T, cable.pretension_n) for angle in cable.angles_deg)
-        return cls((segment,), tendons, guides)
+        segments: list[Segment] = []
+        tendons: list[Tendon] = []
+        for k, part in enumerate(config.chain):
+            rod, cable, mass = part.backbone, part.tendons, part.mass
+            EI = rod.youngs_modulus_pa * math.pi * rod.diameter_m**4 / 64
+            backbone_kg = mass.backbone_density_kg_m3 * math.pi * rod.diameter_m**2 / 4 * part.length_m
+            spread_kg = backbone_kg + mass.tendons_kg + (part.disks - 1) * mass.disk_kg
+            segment = Segment(
+                L=part.length_m,
+                r=part.pitch_radius_m,
+                disks=part.disks,
+                EI=EI,
+                GJ=EI / (1 + rod.poisson_ratio),  # G = E / 2(1 + nu), J = 2 I for a round rod
+                line_mass=spread_kg / part.length_m,
+                end_mass=mass.end_disk_kg,
+            )
+            segments.append(segment)
+            length = math.fsum(s.L for s in segments) + cable.routing_length_m
+            EA_T = cable.youngs_modulus_pa * math.pi * cable.diameter_m**2 / 4
+            k_T = 1 / (length / EA_T + 1 / cable.servo_stiffness_n_per_m)
+            tendons += [Tendon(math.radians(angle), k_T, cable.pretension_n, k) for angle in cable.angles_deg]
+        return cls(tuple(segments), tuple(tendons), guides)
 
     def scaled(self, *, EI: float = 1.0, GJ: float = 1.0, k_T: float = 1.0, T0: float = 1.0) -> "ArmParameters":
         """The same arm with stiffnesses and pretension multiplied by these factors."""

@@ -55,14 +55,12 @@ class RodDetail:
         per = mesh.nodes.size // count
         edges = np.concatenate(([0.0], np.cumsum(mesh.lengths)))
         piece = np.clip(np.searchsorted(edges, at, side="right") - 1, 0, count - 1)
-        x, w = legendre.leggauss(per)
-        analysis = (legendre.legvander(x, per - 1) * w[:, None]).T * (np.arange(per)[:, None] + 0.5)
         R = np.empty((at.size, 3, 3))
         p = np.empty((at.size, 3))
         start = np.zeros(3)
         for k in range(count):
             nodes = slice(k * per, (k + 1) * per)
-            y, t = (analysis @ D[a, :3, nodes].T for a in (0, 2))  # Legendre coefficients (per, 3)
+            y, t = (mesh.analysis @ D[a, :3, nodes].T for a in (0, 2))  # Legendre coefficients (per, 3)
             here = piece == k
             local = 2 * (at[here] - edges[k]) / mesh.lengths[k] - 1
             t_at, y_at = legendre.legval(local, t).T, legendre.legval(local, y).T
@@ -75,21 +73,26 @@ class RodDetail:
     def path_beyond(self, s: float) -> Array:
         """See `Detail.path_beyond`."""
         rod, mesh, cables = self.rod, self.rod.mesh, self.solved.state.cables
+        if s <= 0:
+            return np.asarray(self.beyond - cables.longer)
         # Shortening per length at the nodes, integrated from s to the end by its own polynomial.
         bend = (self.solved.state.kappa[:2] ** 2).sum(axis=0)
         rate = (rod.cable_weights > 0) * (1 - cables.length) + rod.node_chord * bend
         count = len(mesh.lengths)
         per = mesh.nodes.size // count
-        x, w = legendre.leggauss(per)
-        analysis = (legendre.legvander(x, per - 1) * w[:, None]).T * (np.arange(per)[:, None] + 0.5)
         total, before = self.beyond.copy(), 0.0
         for k, length in enumerate(mesh.lengths):
             local = float(np.clip(2 * (s - before) / length - 1, -1.0, 1.0))
-            coefficients = analysis @ rate[:, k * per : (k + 1) * per].T
+            coefficients = mesh.analysis @ rate[:, k * per : (k + 1) * per].T
             integral = legendre.legint(coefficients, lbnd=-1, axis=0)
             total += 0.5 * length * (legendre.legval(1.0, integral) - legendre.legval(local, integral))
             before += length
         return np.asarray(total)
+
+    def turning(self) -> float:
+        """See `Detail.turning`."""
+        kx, ky, _ = self.solved.state.kappa
+        return float(self.rod.mesh.weights @ np.hypot(kx, ky))
 
     def derivatives(self) -> Derivatives:
         """See `Detail.derivatives`: one linear system, that of the last Newton step, for all of them."""

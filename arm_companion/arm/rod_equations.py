@@ -16,7 +16,7 @@ Tendon i runs at r (cos phi_i, sin phi_i) off the backbone; its path is the inte
 included: twist stretches every tendon, and tension stiffens the arm against it (by a third in the reference arm).
 
 The cost here is that of calling NumPy some hundred times, so the code stacks what can be stacked. "Wrapped" arrays
-hold components x, y, z, x, y along one axis: the vector product is then a[1:4] b[2:5] - a[2:5] b[1:4].
+hold components x, y, z, x, y, ... along one axis: the vector product, two shorter, is then a[1:] b[2:] - a[2:] b[1:].
 """
 
 from dataclasses import dataclass, field
@@ -31,6 +31,7 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 
 _WRAP = np.array((0, 1, 2, 0, 1))
+_WRAP_THRICE = np.array((0, 1, 2, 0, 1, 2, 0, 1, 2))
 _SYMMETRIC = np.array((0, 1, 3, 1, 2, 4, 3, 4, 5))  # where the six distinct blocks of a symmetric 3 x 3 go
 _EYE = np.eye(3)
 # Skew matrix, row by row, of a turn given in (u_x, u_y, u_z): about y, -x and the tangent.
@@ -168,7 +169,9 @@ class Rod:
         self._cables(segments)
         self._masses(segments)
         nb, q = mesh.modes, mesh.nodes.size
-        self._steps = np.ascontiguousarray(mesh.steps.T)
+        a1, a2, a3 = mesh.steps.reshape(3, -1, nb)
+        steps = (a1 / 240, a2, 4 * a1, a3 / 120, (20 * a1 + a3) / 240, a1 + a3 / 12)
+        self._steps = np.ascontiguousarray(np.concatenate(steps).T)
         self._basis = np.asarray(mesh.basis)
         self._basis_t = np.ascontiguousarray(mesh.basis.T)
         self._weighted_t = np.ascontiguousarray(mesh.weighted.T)
@@ -227,12 +230,14 @@ class Rod:
         Sixth-order Magnus steps on every interval, in (u_x, u_y, u_z), which are section axes turned by a
         quarter about the tangent; then products by doubling.
         """
-        alpha = (x @ self._steps)[_WRAP]
-        k = alpha.shape[1] // 3
-        a1, a2, a3 = alpha[:, :k], alpha[:, k : 2 * k], alpha[:, 2 * k :]
-        c1 = _wrapped_cross(a1, a2)[_WRAP]
-        c2 = _wrapped_cross(a1, 2 * a3 - c1)[_WRAP]
-        turn = a1[:3] + a3[:3] / 12 + _wrapped_cross(20 * a1 + a3 + c1, a2 + c2 / 60) / 240
+        # With a1, a2, a3 of `Mesh.steps`: turn = a1 + a3/12 + (20 a1 + a3 + c1) x (a2 + c2/60) / 240,
+        # c1 = a1 x a2, c2 = a1 x (2 a3 - c1); the tables hold the combinations, and every product is two rows shorter.
+        mixed = (x @ self._steps)[_WRAP_THRICE]
+        k = mixed.shape[1] // 6
+        a, b, c, d, e, f = (mixed[:, i * k : (i + 1) * k] for i in range(6))
+        c1 = _wrapped_cross(a, b)
+        c2 = _wrapped_cross(c[:7], d[:7] - c1)
+        turn = f[:3] + _wrapped_cross(e[:5] + c1[:5], b[:5] + c2)
         t = np.sqrt(np.add.reduce(turn * turn, axis=0) + _TINY)
         half = np.sin(0.5 * t) / t
         K = (turn.T @ _SKEW).reshape(k, 3, 3)
@@ -381,8 +386,8 @@ class Rod:
 
 
 def _wrapped_cross(a: Array, b: Array) -> Array:
-    """Vector products (3, k) of wrapped columns (5, k)."""
-    return a[1:4] * b[2:5] - a[2:5] * b[1:4]
+    """Vector products (rows - 2, k) of wrapped columns (rows, k)."""
+    return a[1:-1] * b[2:] - a[2:] * b[1:-1]
 
 
 def _moment_of(force: Array) -> Array:

@@ -7,6 +7,7 @@ u_z modes]; within each axis by degree, then piece, so that c[0] and c[modes] of
 u. Everything here depends on lengths only and is computed once.
 """
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -37,6 +38,7 @@ class Mesh:
         steps: (3 k, modes): moments of the modes over the k intervals between nodes, for the Magnus steps.
         at_nodes: which interval ends at each node (q,).
         ends: index into the intervals of each piece's end (m,).
+        analysis: (per, per) from values at the nodes of one piece to Legendre coefficients of their interpolant.
     """
 
     lengths: tuple[float, ...]
@@ -56,10 +58,12 @@ class Mesh:
     steps: Array
     at_nodes: "np.typing.NDArray[np.intp]"
     ends: "np.typing.NDArray[np.intp]"
+    analysis: Array
 
 
+@functools.lru_cache(maxsize=64)
 def build(lengths: tuple[float, ...], bending: int, twist: int, per_piece: int) -> Mesh:
-    """The tables.
+    """The tables, kept: many rods differ in stiffness only.
 
     Args:
         lengths: of the pieces, m.
@@ -68,7 +72,8 @@ def build(lengths: tuple[float, ...], bending: int, twist: int, per_piece: int) 
         per_piece: Gauss nodes on each piece.
     """
     x, w = legendre.leggauss(per_piece)
-    local = _integration(x, w)
+    analysis = (legendre.legvander(x, per_piece - 1) * w[:, None]).T * (np.arange(per_piece)[:, None] + 0.5)
+    local = _integration(x, analysis)
     count, total = len(lengths), per_piece * len(lengths)
     modes = (bending + 1) * count
     starts = np.concatenate(([0.0], np.cumsum(lengths)))
@@ -109,16 +114,13 @@ def build(lengths: tuple[float, ...], bending: int, twist: int, per_piece: int) 
         steps=sealed(steps),
         at_nodes=place + piece,  # one interval more than nodes on every piece
         ends=(np.arange(count) + 1) * (per_piece + 1) - 1,
+        analysis=sealed(analysis),
     )
 
 
-def _integration(x: Array, w: Array) -> Array:
+def _integration(x: Array, analysis: Array) -> Array:
     """A (q, q): A @ f is the integral of the interpolant of f from -1 to each Gauss node."""
-    n = x.size
-    values = legendre.legvander(x, n - 1)
-    # Legendre coefficients of the interpolant, exact for Gauss nodes.
-    analysis = (values * w[:, None]).T * (np.arange(n)[:, None] + 0.5)
-    integrals = np.column_stack([legendre.legval(x, legendre.legint(row, lbnd=-1)) for row in np.eye(n)])
+    integrals = np.column_stack([legendre.legval(x, legendre.legint(row, lbnd=-1)) for row in np.eye(x.size)])
     return np.asarray(integrals @ analysis)
 
 

@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from arm_companion.arm import arc, rod_solver, statics
+from arm_companion.arm import rod_solver, statics
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
 from arm_companion.arm.rod_equations import Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
-from arm_companion.errors import ConfigError, LimitViolated, NoSolution
+from arm_companion.arm.unloaded import UnloadedArm
+from arm_companion.errors import LimitViolated, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
@@ -22,7 +23,7 @@ _NOTHING = Payload(0.0)
 _ZERO = sealed(np.zeros(3))
 
 
-class RodModel:
+class RodModel(UnloadedArm):
     """`ArmModel` by the rod with curvature modes.
 
     Args:
@@ -30,18 +31,25 @@ class RodModel:
         tolerance: imbalance between the modes (`Rod.imbalance`) above which a finer discretisation is taken;
             tip and base wrench are good to about ten times this.
         refuse: imbalance of the finest discretisation above which the answer is refused.
-        fast: whether to use numba (the extra `fast`). Compiling, or reading the compiled code from numba's
-            cache, is done here and now, and never in flight.
+        levels: the discretisations, coarse to fine, as `LEVELS`.
+        fast: whether to use numba (the extra `fast`). What `compiled.load` has not loaded yet is loaded, or
+            compiled, here and now, and never in flight.
 
     Raises:
         ImportError: when `fast` is asked for and numba is not installed.
     """
 
     def __init__(
-        self, parameters: ArmParameters, *, tolerance: float = 3e-6, refuse: float = 1e-4, fast: bool = False
+        self,
+        parameters: ArmParameters,
+        *,
+        tolerance: float = 3e-6,
+        refuse: float = 1e-4,
+        levels: tuple[tuple[int, int, int], ...] = LEVELS,
+        fast: bool = False,
     ) -> None:
-        self._parameters = parameters
-        self._tolerance, self._refuse = tolerance, refuse
+        super().__init__(parameters)
+        self._tolerance, self._refuse, self._levels = tolerance, refuse, levels
         self._none = sealed(np.zeros(parameters.n))
         self._slack = sealed(parameters.T0 / parameters.k_T)  # stretch at zero pull
         self._rods: dict[tuple[float, int], Rod] = {}
@@ -50,34 +58,6 @@ class RodModel:
             from arm_companion.arm.fast import FastRod  # noqa: PLC0415 - numba is optional, and slow to import
 
             self._make = FastRod
-
-    @property
-    def parameters(self) -> ArmParameters:
-        """The arm."""
-        return self._parameters
-
-    def pull_for_bend(self, bend: ArrayLike, pretension: float | None = None) -> Array:
-        """See `ArmModel.pull_for_bend`."""
-        return statics.pull_for_bend(self._parameters, bend, pretension)
-
-    def pull_for_tension(self, bend: ArrayLike, tension: ArrayLike) -> Array:
-        """See `ArmModel.pull_for_tension`."""
-        return statics.pull_for_tension(self._parameters, bend, tension)
-
-    def bend_for_pull(self, pull: ArrayLike) -> Array:
-        """See `ArmModel.bend_for_pull`."""
-        return statics.bend_for_pull(self._parameters, pull)
-
-    def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
-        """See `ArmModel.bend_for_tip`; an unloaded segment is an arc.
-
-        Raises:
-            ConfigError: for several segments, which reach most points in many ways.
-        """
-        if len(self._parameters.segments) != 1:
-            raise ConfigError("the bend for a tip position is defined for one segment")
-        L = self._parameters.L
-        return arc.bend_for_tip(p_tip_base, L, 0.01 * L if tolerance is None else tolerance)
 
     def free(
         self,
@@ -92,15 +72,8 @@ class RodModel:
     ) -> ArmSolution:
         """See `ArmModel.free`.
 
-        Args:
-            pull: tendon goals (n,), m.
-            gravity: (3,), m/s^2, base axes.
-            tip_wrench: dead load at the tip (6,) [N; N m], base axes.
-            payload: what the tip carries.
-            follower_wrench: load that turns with the tip (6,) [N; N m], tip axes.
-            tension: of each tendon under tension control (n,), N; the motors give way as needed and `pull`
-                does not count.
-            start: a neighbouring solution to start from.
+        With `tension` (n,), N, the tendons are under tension control: the motors give way as needed, and `pull`
+        does not count.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that loading follows.
@@ -128,12 +101,7 @@ class RodModel:
     ) -> ArmSolution:
         """See `ArmModel.held`.
 
-        Args:
-            pull: tendon goals (n,), m.
-            hold: what is held and where it is now.
-            gravity: (3,), m/s^2, base axes.
-            tension: of each tendon under tension control (n,), N; `pull` and `hold.beyond` do not count.
-            start: a neighbouring solution of the same kind of hold.
+        With `tension` (n,), N, the tendons are under tension control: `pull` and `hold.beyond` do not count.
 
         Raises:
             NoSolution: when no stable equilibrium is found on the branch that leads there.
@@ -194,7 +162,7 @@ class RodModel:
         if rod is None:
             if len(self._rods) >= 64:  # a hold that wanders along the arm must not fill the memory
                 self._rods.clear()
-            rod = self._rods[key] = self._make(self._parameters, s, *LEVELS[level])
+            rod = self._rods[key] = self._make(self._parameters, s, *self._levels[level])
         return rod
 
     def _solve(self, s: float, goal: Problem, payload: Payload, beyond: Array, start: ArmSolution | None) -> RodDetail:
@@ -203,7 +171,7 @@ class RodModel:
         while True:
             rod = self._rod(s, level)
             imbalance = rod.imbalance(solved.state) if solved.imbalance is None else solved.imbalance
-            if imbalance <= self._tolerance or level + 1 == len(LEVELS):
+            if imbalance <= self._tolerance or level + 1 == len(self._levels):
                 break
             level += 1
             solved = self._refined(rod, self._rod(s, level), goal, solved, imbalance)
@@ -234,7 +202,7 @@ class RodModel:
         if not isinstance(detail, RodDetail) or detail.rod.s != s or not _same_kind(detail.solved.problem, goal):
             detail = None
         lowest = 0 if detail is None else max(0, detail.level - detail.easy)
-        for level in range(lowest, len(LEVELS)):
+        for level in range(lowest, len(self._levels)):
             rod = self._rod(s, level)
             try:
                 if detail is None:
@@ -244,7 +212,7 @@ class RodModel:
                     begin = _at(rod, begin.problem, _padded(begin.c, detail.rod, rod), begin.wrench)
                 return level, rod_solver.follow(rod, begin, goal, "from the solution given")
             except NoSolution:
-                if level + 1 == len(LEVELS):
+                if level + 1 == len(self._levels):
                     raise
         raise NoSolution(math.inf, "no discretisation")
 

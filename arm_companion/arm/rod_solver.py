@@ -31,6 +31,10 @@ STEP_LIMIT = 0.6
 _BRANCH = 0.8  # rad, that a mode may move in one homotopy step
 _SMALLEST_STEP = 1 / 512
 _STIFFEN = 1e4  # of forbidden motions, when only the allowed ones are to be judged
+INDIFFERENT = 1e-6
+"""Stiffness, relative to the rod's own, under which a motion costs nothing: a straight arm that buckles does so in any
+plane, and which one is not the model's to say."""
+
 _NO_DIRECTION = np.zeros((0, 3))
 _EYE = np.eye(3)
 _ORIGIN = [0.0, 0.0, 0.0]
@@ -269,6 +273,7 @@ def is_stable(rod: Rod, solved: Solved) -> bool:
     if solved.tangent is None:
         solved.tangent = rod.tangent(solved.state, solved.loads, solved.problem.stiffness)
     K = 0.5 * (solved.tangent + solved.tangent.T)
+    K.reshape(-1)[:: len(K) + 1] -= INDIFFERENT * rod.moment_scale
     C = solved.held
     if C is None:
         return _positive(K)
@@ -317,7 +322,7 @@ def follow(rod: Rod, start: Solved, goal: Problem, what: str) -> Solved:
         elif _largest(found.c - here.c) > _BRANCH:
             reason = "another branch"
         elif not is_stable(rod, found):
-            reason = "the arm buckles or snaps"
+            reason = "the arm buckles or snaps, or nothing says which way"
         if isinstance(found, str) or reason:
             step = 0.5 * (to - done)
             if step < _SMALLEST_STEP:

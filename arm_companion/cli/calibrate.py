@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from arm_companion.arm import identification
+from arm_companion.arm import compiled, identification
 from arm_companion.arm.identification import Fit, LoadingTest
 from arm_companion.arm.parameters import Guides
 from arm_companion.arm.rod_model import RodModel
@@ -94,12 +94,14 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
         raise _RefusedError("--figure needs 'matplotlib': pip install 'arm-companion[sim]'")
     if arguments.output is not None and arguments.settings:
         raise _RefusedError("--output extends the configuration file: put what --set changes into that file")
+    if config.arm.segments:
+        raise _RefusedError(f"a loading test is fitted for one segment, and this arm has {len(config.arm.chain)}")
     parameters = case.arm(config, Guides(arguments.guides))
     readings = loading_csv.parse(arguments.data.read_text(encoding="utf-8-sig"), RodModel(parameters))
     field = case.field(config, on=arguments.gravity, attitude_deg=arguments.attitude_deg)
     test = LoadingTest(readings, field)
     names = [name.strip() for name in arguments.fit.split(",") if name.strip()]
-    fit = identification.fit(parameters, test, names, mu=config.arm.tendons.guide_friction)
+    fit = identification.fit(parameters, test, names, mu=config.arm.tendons.guide_friction, fast=_compiled())
     if arguments.output is not None:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
         arguments.output.write_text(drop_in(fit, config, locate(arguments.config), arguments.output), encoding="utf-8")
@@ -110,6 +112,15 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
         figures.calibration(test, fit, arguments.figure)
     print(json.dumps(_plain(fit, len(readings))) if arguments.json else _table(fit, len(readings)))
     return 0
+
+
+def _compiled() -> bool:
+    """Whether compiled mechanics are at hand; compiling them would take longer than a fit."""
+    try:
+        compiled.load(compiling=False)
+    except compiled.NotCompiled:
+        return False
+    return True
 
 
 def drop_in(fit: Fit, config: Config, base: Path, target: Path) -> str:

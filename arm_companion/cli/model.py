@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from arm_companion.arm import compiled
 from arm_companion.arm.model import ArmSolution, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 from arm_companion.arm.rod_model import RodModel
@@ -38,6 +39,7 @@ _EXPERIMENTS = {
     "stiffness-test": "the paper's stiffness test: five bends, loaded inward and outward",
     "perching": "the paper's perching benchmark: tip held, base moved in x and z and back",
 }
+_LARGEST = 1e9  # of any argument: beyond it lie no arms, and squares overflow
 _TIPS = {"clamped": HoldKind.CLAMPED, "pinned": HoldKind.PINNED}
 
 
@@ -59,6 +61,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         else:
             _add_case(sub, held=name == "clamp")
         sub.add_argument("--json", action="store_true", help="print one JSON object (SI units)")
+    text = "compile the mechanics into numba's cache, for the daemon to load (extra fast)"
+    commands.add_parser("warm", help=text, description=text[0].upper() + text[1:] + ".")
 
 
 def _add_arm(parser: argparse.ArgumentParser) -> None:
@@ -87,9 +91,13 @@ def _add_arm(parser: argparse.ArgumentParser) -> None:
 
 def _add_case(parser: argparse.ArgumentParser, *, held: bool) -> None:
     parser.add_argument(
-        "--theta-deg", type=float, metavar="A", help="bend of the unloaded, gravity-free arm (default: 0)"
+        "--theta-deg",
+        nargs="+",
+        type=float,
+        metavar="A",
+        help="bend of the unloaded, gravity-free arm; for several segments one each, from base to tip (default: 0)",
     )
-    parser.add_argument("--delta-deg", type=float, metavar="A", help="its bending plane from x (default: 0)")
+    parser.add_argument("--delta-deg", nargs="+", type=float, metavar="A", help="bending planes from x (default: 0)")
     parser.add_argument("--pull-m", nargs="+", type=float, metavar="Q", help="tendon goals instead of a bend")
     if held:
         parser.add_argument(
@@ -146,12 +154,16 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Answer; exit code 2 with one line on standard error when it is refused."""
+    if arguments.action == "warm":
+        return _warm()
     config = load_from(arguments)
     try:
         _check(arguments)
         parameters = case.arm(config, Guides(arguments.guides), arguments.pretension_n)
         on = arguments.gravity if arguments.gravity is not None else arguments.attitude_deg is not None
         gravity = case.field(config, on=on, attitude_deg=arguments.attitude_deg)
+        if arguments.action in _EXPERIMENTS and len(parameters.segments) > 1:
+            raise _RefusedError(f"the paper's arm has one segment, this one {len(parameters.segments)}")
         if arguments.action == "stiffness-test":
             return _stiffness_test(arguments, config, parameters, gravity)
         if arguments.action == "perching":
@@ -167,12 +179,23 @@ def run(arguments: argparse.Namespace) -> int:
         return 1
 
 
+def _warm() -> int:
+    begun = time.perf_counter()
+    try:
+        place = compiled.load(compiling=True)
+    except compiled.NotCompiled as error:
+        print(f"arm-companion model warm: {error}", file=sys.stderr)
+        return 2
+    print(f"compiled mechanics are in {place}, after {time.perf_counter() - begun:.1f} s")
+    return 0
+
+
 def _check(arguments: argparse.Namespace) -> None:
     """Refuse what no case can have."""
     for name, value in vars(arguments).items():
         values = value if isinstance(value, list | tuple) else [value]
-        if any(isinstance(v, float) and not math.isfinite(v) for v in values):
-            raise _RefusedError(f"--{name.replace('_', '-')} takes finite numbers")
+        if any(isinstance(v, float) and not abs(v) <= _LARGEST for v in values):
+            raise _RefusedError(f"--{name.replace('_', '-')} takes finite numbers, up to {_LARGEST:g}")
     if arguments.pretension_n is not None and arguments.pretension_n < 0:
         raise _RefusedError(f"--pretension-n {arguments.pretension_n:g}: tendons cannot push")
     if getattr(arguments, "payload_kg", 0.0) < 0:
@@ -183,7 +206,13 @@ def _check(arguments: argparse.Namespace) -> None:
 
 def _pull(arguments: argparse.Namespace, parameters: ArmParameters) -> Array:
     if arguments.pull_m is None:
-        return case.goals(parameters, arguments.theta_deg or 0.0, arguments.delta_deg or 0.0)
+        theta, delta = (given or [0.0] for given in (arguments.theta_deg, arguments.delta_deg))
+        segments = len(parameters.segments)
+        if max(len(theta), len(delta)) > segments:
+            raise _RefusedError(f"{max(len(theta), len(delta))} bends for {segments} segment{'s' * (segments > 1)}")
+        if len(delta) not in (1, len(theta)):
+            raise _RefusedError(f"--delta-deg has {len(delta)} planes for {len(theta)} bends")
+        return case.goals(parameters, theta, delta)
     if arguments.theta_deg is not None or arguments.delta_deg is not None:
         raise _RefusedError("give a bend or --pull-m, not both")
     if len(arguments.pull_m) != parameters.n:
@@ -206,7 +235,8 @@ def _case(arguments: argparse.Namespace, config: Config, parameters: ArmParamete
         force, moment = arguments.force or nothing, arguments.moment or nothing
         solution = asked.free(force, moment, follower=arguments.follower)
     elapsed = time.perf_counter() - begun
-    answer = _answer(solution, parameters, math.radians(arguments.delta_deg or 0.0), elapsed)
+    delta = math.radians((arguments.delta_deg or [0.0])[0])
+    answer = _answer(solution, parameters, delta, elapsed)
     if arguments.json:
         print(json.dumps(answer))
     else:
@@ -215,7 +245,7 @@ def _case(arguments: argparse.Namespace, config: Config, parameters: ArmParamete
 
 
 def _answer(solution: ArmSolution, parameters: ArmParameters, delta: float, elapsed: float) -> dict[str, Any]:
-    """The command-line contract: every key of it, SI units."""
+    """The command-line contract: every key of it, SI units; K_psi is defined for one segment, null for more."""
     return {
         "tip_position_m": solution.tip_position.tolist(),
         "tip_rotation": solution.tip_rotation.tolist(),
@@ -226,7 +256,7 @@ def _answer(solution: ArmSolution, parameters: ArmParameters, delta: float, elap
         "tip_moment_nm": solution.tip_wrench[3:].tolist(),
         "stiffness_n_per_m": case.stiffness(solution.compliance).tolist(),
         "compliance": solution.compliance.tolist(),
-        "k_psi": case.k_psi(solution, parameters, delta).tolist(),
+        "k_psi": case.k_psi(solution, parameters, delta).tolist() if len(parameters.segments) == 1 else None,
         "converged": True,  # what does not converge is refused
         "residual": solution.residual,
         "solve_time_s": elapsed,

@@ -80,6 +80,7 @@ def _stiffness(answer: dict[str, Any], solution: ArmSolution) -> list[str]:
         lines.append(f"{'along ' + name + ' of the end disk':<24}{k:10.4f}  N/m, free to give sideways")
     lines.append("compliance [m; rad] per [N; N m]:")
     lines += ["".join(f"{round(value, 6) + 0.0:12.6f}" for value in row) for row in answer["compliance"]]
-    lines.append("K_psi of the paper, corrected, N m/rad, in (theta, delta):")
-    lines += ["".join(f"{round(value, 6) + 0.0:12.6f}" for value in row) for row in answer["k_psi"]]
+    if answer["k_psi"] is not None:
+        lines.append("K_psi of the paper, corrected, N m/rad, in (theta, delta):")
+        lines += ["".join(f"{round(value, 6) + 0.0:12.6f}" for value in row) for row in answer["k_psi"]]
     return lines

@@ -14,7 +14,10 @@ class NumberParser(argparse.ArgumentParser):
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """See `argparse.ArgumentParser.parse_known_args`."""
         words = None if args is None else [f" {word}" if _is_negative(word) else word for word in args]
-        return super().parse_known_args(words, namespace)
+        found, unknown = super().parse_known_args(words, namespace)
+        if unknown:  # else the parser above would refuse it, with its usage in front
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return found, unknown
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong in one line; exit code 2."""

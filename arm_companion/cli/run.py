@@ -32,7 +32,7 @@ def run(arguments: argparse.Namespace) -> int:
         manager = ServiceManager()
         try:
             clock = Clock(asyncio.get_running_loop(), unix_now())
-            await Daemon(config, open_configured(config), clock, manager).run(stop)
+            await Daemon(config, open_configured(config), clock, manager, compiled_model=True).run(stop)
         finally:
             restore()
             manager.close()

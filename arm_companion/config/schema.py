@@ -4,6 +4,7 @@ Keys follow the sections of the TOML files in `configs/`. SI units throughout; w
 its suffix says so.
 """
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -60,8 +61,23 @@ class ArmMassConfig:
 
 
 @dataclass(frozen=True)
+class SegmentConfig:
+    """[[arm.segments]] One more segment, carried by the last; its tendons run through all segments before it.
+
+    What is absent is as in [arm]; a table that is there stands for itself, with its own defaults.
+    """
+
+    length_m: float | None = option("backbone length, to its end disk", None, unit="m", lower=0.02, upper=3.0)
+    pitch_radius_m: float | None = option("radius of its pitch circle", None, unit="m", lower=1e-3, upper=0.2)
+    disks: int | None = option("its disks, end disk included", None, lower=2, upper=200)
+    backbone: BackboneConfig | None = None
+    tendons: ArmTendonsConfig | None = None
+    mass: ArmMassConfig | None = None
+
+
+@dataclass(frozen=True)
 class ArmConfig:
-    """[arm] Geometry and material of the continuum arm (one segment)."""
+    """[arm] Geometry and material of the continuum arm: its only segment, or the one at the base."""
 
     length_m: float = option("backbone length, base disk to end disk", 0.25, unit="m", lower=0.02, upper=3.0)
     pitch_radius_m: float = option("radius of the tendons' pitch circle", 0.02, unit="m", lower=1e-3, upper=0.2)
@@ -70,10 +86,34 @@ class ArmConfig:
     backbone: BackboneConfig = section(BackboneConfig)
     tendons: ArmTendonsConfig = section(ArmTendonsConfig)
     mass: ArmMassConfig = section(ArmMassConfig)
+    segments: tuple[SegmentConfig, ...] = option("further segments, from base to tip; for research", ())
 
     def __post_init__(self) -> None:
-        if len(self.tendons.angles_deg) < 3:  # fewer cannot pull every way
-            raise ConfigError(f"tendons.angles_deg has {len(self.tendons.angles_deg)} entries; at least 3 are needed")
+        for tendons in (self.tendons, *(segment.tendons for segment in self.segments)):
+            if tendons is not None and len(tendons.angles_deg) < 3:  # fewer cannot pull every way
+                raise ConfigError(f"tendons.angles_deg has {len(tendons.angles_deg)} entries; at least 3 are needed")
+
+    @property
+    def chain(self) -> "tuple[ArmConfig, ...]":
+        """Every segment as an arm of its own, from base to tip."""
+        further = [
+            dataclasses.replace(
+                self,
+                segments=(),
+                **{
+                    f.name: value
+                    for f in dataclasses.fields(segment)
+                    if (value := getattr(segment, f.name)) is not None
+                },
+            )
+            for segment in self.segments
+        ]
+        return (dataclasses.replace(self, segments=()), *further)
+
+    @property
+    def tendon_count(self) -> int:
+        """Of all segments together."""
+        return sum(len(segment.tendons.angles_deg) for segment in self.chain)
 
 
 @dataclass(frozen=True)
@@ -305,10 +345,9 @@ class Config:
     sim: SimConfig = section(SimConfig)
 
     def __post_init__(self) -> None:
-        if len(self.servos.ids) != len(self.arm.tendons.angles_deg):
-            raise ConfigError(
-                f"servos.ids has {len(self.servos.ids)} entries for {len(self.arm.tendons.angles_deg)} tendons"
-            )
+        # research needs no servos: an arm of three tendons, or of two segments, may leave them as they are
+        if self.servos.ids != ServosConfig().ids:
+            self.check_servos()
         if self.perch.wrap_bend_rad > self.limits.bend_max_rad:
             raise ConfigError(
                 f"perch.wrap_bend_rad = {self.perch.wrap_bend_rad:g} is over limits.bend_max_rad = "
@@ -316,3 +355,12 @@ class Config:
             )
         if sum(link.role == "autopilot" for link in self.links.values()) > 1:
             raise ConfigError("links: more than one link has the role autopilot")
+
+    def check_servos(self) -> None:
+        """That every tendon has its servo, which only a flight needs.
+
+        Raises:
+            ConfigError: when not.
+        """
+        if len(self.servos.ids) != self.arm.tendon_count:
+            raise ConfigError(f"servos.ids has {len(self.servos.ids)} entries for {self.arm.tendon_count} tendons")

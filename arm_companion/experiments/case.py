@@ -31,20 +31,30 @@ def arm(config: Config, guides: Guides = Guides.CONTINUOUS, pretension: float | 
     return replace(parameters, tendons=tuple(replace(t, T0=pretension) for t in parameters.tendons))
 
 
-def bend(theta_deg: float, delta_deg: float = 0.0) -> Array:
-    """u (2,), rad, of the paper's psi in degrees."""
-    theta, delta = math.radians(theta_deg), math.radians(delta_deg)
-    return np.array((theta * math.cos(delta), theta * math.sin(delta)))
+def bend(theta_deg: float | Sequence[float], delta_deg: float | Sequence[float] = 0.0) -> Array:
+    """u (2 m,), rad, of the paper's psi in degrees, one pair for each of m segments."""
+    theta, delta = np.broadcast_arrays(np.radians(np.atleast_1d(theta_deg)), np.radians(delta_deg))
+    return np.column_stack((theta * np.cos(delta), theta * np.sin(delta))).ravel()
 
 
-def goals(parameters: ArmParameters, theta_deg: float, delta_deg: float = 0.0) -> Array:
+def goals(
+    parameters: ArmParameters, theta_deg: float | Sequence[float], delta_deg: float | Sequence[float] = 0.0
+) -> Array:
     """Tendon goals (n,), m, for an unloaded, gravity-free bend; they make up for the tendons' own stretch.
 
     The same goals whatever the guides, so that two kinds of guides are compared under one command: with real disks
     the chords take in a little more, and the bend comes out larger, by 0.07 deg in 60 for the reference arm. Where a
     tendon would have to push it goes slack, and the bend comes out smaller.
+
+    Args:
+        parameters: the arm.
+        theta_deg: bend of its segment, or of each from base to tip; those not named stay straight.
+        delta_deg: bending plane, likewise.
     """
-    return statics.pull_for_bend(replace(parameters, guides=Guides.CONTINUOUS), bend(theta_deg, delta_deg))
+    u = np.zeros(2 * len(parameters.segments))
+    asked = bend(theta_deg, delta_deg)
+    u[: asked.size] = asked
+    return statics.pull_for_bend(replace(parameters, guides=Guides.CONTINUOUS), u)
 
 
 def field(config: Config, *, on: bool, attitude_deg: Sequence[float] | None = None) -> Array:

@@ -28,6 +28,8 @@ from arm_companion.geometry.arrays import Array
 
 _XYZ = ("x", "y", "z")
 _PUSHES = -1.0  # N
+_LOADED = 200.0  # times EI / L^2, the load that bends an arm by about a radian
+_TORN = 1000.0  # N
 _REACH = 1.2  # times the length; farther away no tip can be, so the unit must be another
 
 
@@ -147,7 +149,13 @@ def _reading(row: _Row, run: str, model: ArmModel, *, by_bend: bool) -> Reading:
         farthest = float(np.nanmax(np.abs(values), initial=0.0))
         if farthest > _REACH * reach:
             raise DataError(row.line, f"a tip {farthest:g} m away is beyond an arm of {parameters.L:g} m: metres?")
+    dead, follower = row.vector("force_*_n", 0.0), row.vector("follower_*_n", 0.0)
+    largest = float(np.abs((dead, follower)).max())
+    if largest > _LOADED * parameters.EI / parameters.L**2:
+        raise DataError(row.line, f"a load of {largest:g} N would crush this arm: newtons?")
     tension = np.array([row.number(f"tension_{i}_n", math.nan) for i in tendons])
     if float(np.nanmin(tension, initial=0.0)) < _PUSHES:
         raise DataError(row.line, "a tendon cannot push: its tension is negative by more than noise")
-    return Reading(run, pull, row.vector("force_*_n", 0.0), row.vector("follower_*_n", 0.0), position, shift, tension)
+    if (highest := float(np.nanmax(tension, initial=0.0))) > _TORN:
+        raise DataError(row.line, f"a tension of {highest:g} N would tear any tendon: newtons?")
+    return Reading(run, pull, dead, follower, position, shift, tension)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from arm_companion.arm import friction
-from arm_companion.arm.model import ArmSolution, Payload
+from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import ModelError
@@ -128,29 +128,10 @@ def run(
         steps: loads up to the greatest.
         cycles: of loading and unloading.
     """
-    model = _PulleyModel(parameters)
+    model = RodModel(parameters)
     g = np.asarray(gravity, dtype=np.float64)
     schedule = list(loads(step, steps, cycles))
     return [_curve(model, angle, inward, g, mu, schedule) for inward in (True, False) for angle in bends_deg]
-
-
-class _PulleyModel(RodModel):
-    """The rod under tip loads that turn with the end disk."""
-
-    def free(
-        self,
-        pull: ArrayLike,
-        gravity: ArrayLike,
-        tip_wrench: ArrayLike | None = None,
-        payload: Payload | None = None,
-        *,
-        follower_wrench: ArrayLike | None = None,
-        tension: ArrayLike | None = None,
-        start: ArmSolution | None = None,
-    ) -> ArmSolution:
-        """As `RodModel.free`, with `tip_wrench` in tip axes."""
-        load = follower_wrench if tip_wrench is None else tip_wrench
-        return super().free(pull, gravity, None, payload, follower_wrench=load, tension=tension, start=start)
 
 
 def _curve(
@@ -168,9 +149,9 @@ def _curve(
         for cycle, loading, force in schedule:
             load = np.array((force if inward else -force, 0.0, 0.0, 0.0, 0.0, 0.0))
             if mu > 0:
-                now, grip = friction.step(model, mu, grip, pull, gravity, load, start=now)
+                now, grip = friction.step(model, mu, grip, pull, gravity, follower_wrench=load, start=now)
             else:
-                now = model.free(pull, gravity, load, start=now)
+                now = model.free(pull, gravity, follower_wrench=load, start=now)
             readings.append(_reading(bend_deg, inward, cycle, loading, force, now, rest))
     except ModelError as error:
         return Curve(bend_deg, inward, initial, tuple(readings), str(error))

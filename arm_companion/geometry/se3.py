@@ -28,7 +28,7 @@ class Pose:
 
     def __post_init__(self) -> None:
         R = frozen(self.rotation, (3, 3), "rotation")
-        if np.abs(R.T @ R - np.eye(3)).max() > _ORTHOGONAL or np.linalg.det(R) < 0:
+        if not so3.is_rotation(R, _ORTHOGONAL):
             raise ValueError(f"not a rotation: {R.tolist()}")
         object.__setattr__(self, "rotation", R)
         object.__setattr__(self, "position", frozen(self.position, (3,), "position"))

@@ -96,6 +96,20 @@ def inverse_left_jacobian(v: ArrayLike) -> Array:
     return np.eye(3) - 0.5 * K + d * (K @ K)
 
 
+def is_rotation(R: Array, tolerance: float) -> bool:
+    """Whether the columns of R (3, 3) are a right-handed orthonormal triad, each product to within `tolerance`."""
+    (a, b, c), (d, e, f), (g, h, i) = R.tolist()  # plain numbers: NumPy takes five times as long for so few
+    off = max(
+        abs(a * a + d * d + g * g - 1),
+        abs(b * b + e * e + h * h - 1),
+        abs(c * c + f * f + i * i - 1),
+        abs(a * b + d * e + g * h),
+        abs(a * c + d * f + g * i),
+        abs(b * c + e * f + h * i),
+    )
+    return bool(off <= tolerance and a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0)
+
+
 def from_rpy(roll: float, pitch: float, yaw: float) -> Array:
     """R_12 (3, 3) = Rz(yaw) Ry(pitch) Rx(roll), rad: turns axes 1 into axes 2, maps coordinates in 2 to 1."""
     cr, sr = math.cos(roll), math.sin(roll)

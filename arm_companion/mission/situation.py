@@ -7,17 +7,16 @@ from functools import cached_property
 
 import numpy as np
 
-from arm_companion.arm.model import ArmModel, ArmSolution
+from arm_companion.arm.model import ArmModel
 from arm_companion.arm.reaction import GRAVITY, mount
 from arm_companion.config.schema import Config
-from arm_companion.errors import ModelError
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Vec3
 from arm_companion.mission.motion import dot, norm, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, State
 
-_FROM_FACTS = frozenset({"gravity_a", "mount", "bend", "free_arm"})
+_FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
 
 
 @dataclass(frozen=True)
@@ -137,14 +136,6 @@ class Situation:
     def bend_error(self) -> float:
         """Distance between commanded and measured bend, rad."""
         return math.hypot(self.bend[0] - self.state.bend[0], self.bend[1] - self.state.bend[1])
-
-    @cached_property
-    def free_arm(self) -> ArmSolution | None:
-        """The arm as it would hang with nothing at its tip; None without a solution."""
-        try:
-            return self.parameters.model.free(np.asarray(self.pulls), np.asarray(self.gravity_a))
-        except ModelError:
-            return None
 
     # --- the bar ---
 

@@ -85,8 +85,9 @@ class Prediction:
     tip_a: Vec3  # m, base axes
     bend: tuple[float, float]  # rad, that the measured displacements stand for
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
-    # where the next solve starts; it follows from what was recorded before, so it is not recorded itself
-    start: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
+    # where the next solves start; they follow from what was recorded before, so they are not recorded themselves
+    free: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
+    anchored: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,19 +38,25 @@ def predict(s: Situation) -> Prediction:
     period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
     if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
         return last
-    holding = s.state.phase in _ANCHORED and s.state.anchor is not None
-    start = last.start if last is not None and holding else None
-    solution = None
+    free = held = None
     with suppress(ModelError):
-        solution = anchored(s, s.state.position, start) if holding else s.free_arm
-    return Prediction(
-        s.t,
-        _wrench(s, solution, holding=holding),
-        _tip(s),
-        s.bend,
-        _lean(s, solution),
-        solution if holding else None,
-    )
+        free = _free(s, None if last is None else last.free)
+    holding = s.state.phase in _ANCHORED and s.state.anchor is not None
+    if holding:
+        with suppress(ModelError):
+            held = anchored(s, s.state.position, None if last is None else last.anchored)
+    solution = held if holding else free
+    tip = _NAN3 if free is None else _vec3(free.tip_position)
+    return Prediction(s.t, _wrench(s, solution, holding=holding), tip, s.bend, _lean(s, solution), free, held)
+
+
+def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:
+    """The arm as it would hang with nothing at its tip.
+
+    Raises:
+        ModelError: no equilibrium was found.
+    """
+    return s.parameters.model.free(np.asarray(s.pulls), np.asarray(s.gravity_a), start=start)
 
 
 def grip(s: Situation) -> Anchor:
@@ -189,10 +195,6 @@ def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:
     north, east, _ = -np.linalg.solve(A, S_move @ move)
     # up and down the autopilot's own loop is stiff and integrates, and a wrap pushed hard there slides
     return float(north), float(east), 0.0
-
-
-def _tip(s: Situation) -> Vec3:
-    return _NAN3 if s.free_arm is None else _vec3(s.free_arm.tip_position)
 
 
 def _nothing(source: WrenchSource) -> WrenchReport:

@@ -28,11 +28,7 @@ _ARC, _ROD, _TRUTH, _FREE = "#dc2626", "#1d4ed8", "#000000", "#9aa5b1"
 
 def arc_under_pulley(pull: np.ndarray, force: float) -> np.ndarray:
     """Bend (2,) of the one arc under a force that turns with its end disk."""
-    u = ARC.bend_for_pull(pull)
-    for _ in range(40):
-        dead = arc.tip_rotation(u) @ (force, 0.0, 0.0)
-        u = ARC.free(pull, FLAT, np.concatenate((dead, FLAT))).bend
-    return u
+    return ARC.free(pull, FLAT, follower_wrench=(force, 0, 0, 0, 0, 0)).bend
 
 
 def shapes(axis: Axes) -> None:

@@ -37,17 +37,20 @@ class WarmSolver:
         self.model, self.pull = model, pull
         self.hold = model.free(pull, GRAVITY).hold(model.parameters.L, HoldKind.CLAMPED)
         self.last: ArmSolution | None = None
-        self.moves = itertools.cycle(path())
+        self.way = itertools.cycle([self.seen(move) for move in path()])
+
+    def under(self, hold: Hold) -> ArmSolution:
+        self.last = self.model.held(self.pull, hold, GRAVITY, start=self.last)
+        return self.last
 
     def at(self, move: np.ndarray) -> ArmSolution:
-        self.last = self.model.held(self.pull, self.seen(move), GRAVITY, start=self.last)
-        return self.last
+        return self.under(self.seen(move))
 
     def seen(self, move: np.ndarray) -> Hold:
         return self.hold.seen_from(Pose(np.eye(3), -move))
 
     def step(self) -> ArmSolution:
-        return self.at(next(self.moves))
+        return self.under(next(self.way))
 
 
 def mechanics(rounds: int) -> Iterator[Result]:
@@ -57,10 +60,10 @@ def mechanics(rounds: int) -> Iterator[Result]:
     pull = rod.pull_for_bend(BEND)
     warm, one_arc = WarmSolver(rod, pull), WarmSolver(ArcModel(smooth), pull)
     shooting = ShootingSolver(smooth, pull, GRAVITY, rod.free(pull, GRAVITY))
-    moves = itertools.cycle(path())
+    way = itertools.cycle([warm.seen(move) for move in path()])
 
     def shoot() -> np.ndarray:
-        hold = warm.seen(next(moves))
+        hold = next(way)
         return shooting.solve(hold.pose.position, hold.pose.rotation)
 
     chain = SettlingChain(config, pull)

@@ -12,27 +12,32 @@ from arm_companion.arm.model import ArmSolution, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 
 
-def _hat(v):
-    return np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+def hat(v):
+    """Skew matrices (k, 3, 3) of vectors (k, 3)."""
+    zero = np.zeros(len(v))
+    x, y, z = v.T
+    return np.stack((zero, -z, y, z, zero, -x, -y, x, zero), axis=1).reshape(-1, 3, 3)
 
 
-def _curvature(moment, tau, offsets, EI, GJ, gap2, guess):
-    """Curvature (kx, ky, kz) of a section with this internal moment, both in section axes."""
+def curvature(moment, tau, offsets, EI, GJ, gap2, guess):
+    """Curvature (k, 3) of sections with these internal moments (k, 3), both in section axes."""
     kappa = guess.copy()
+    stiff = np.array([EI, EI, GJ])
+    soften = 2 * gap2 * tau.sum() * np.array([1.0, 1.0, 0.0])
+    R = hat(offsets)
+    lever = -R @ R
     for _ in range(40):
         # tangent of tendon i: t + kappa x r_i
-        strand = np.array([0.0, 0.0, 1.0]) + np.cross(kappa, offsets)
-        length = np.sqrt((strand**2).sum(axis=1))
+        strand = np.array([0.0, 0.0, 1.0]) + np.cross(kappa[:, None], offsets)
+        length = np.sqrt((strand**2).sum(axis=2))
         # d|strand| / d kappa = (r_i x strand) / |strand|
-        by = np.cross(offsets, strand) / length[:, None]
-        out = np.array([EI, EI, GJ]) * kappa + tau @ by - moment
-        out[:2] -= tau.sum() * 2 * gap2 * kappa[:2]
-        K = np.diag([EI, EI, GJ]) - tau.sum() * 2 * gap2 * np.diag([1.0, 1.0, 0.0])
-        for force, r, ell, b in zip(tau, offsets, length, by, strict=True):
-            R = _hat(r)
-            K += force / ell * (-R @ R - np.outer(b, b))
-        step = np.linalg.solve(K, out)
-        kappa -= step
+        by = np.cross(offsets, strand) / length[..., None]
+        out = (stiff - soften) * kappa + np.einsum("i,kij->kj", tau, by) - moment
+        pulled = tau / length
+        K = np.diag(stiff - soften) + np.einsum("ki,ijl->kjl", pulled, lever)
+        K -= np.einsum("ki,kij,kil->kjl", pulled, by, by)
+        step = np.linalg.solve(K, out[..., None])[..., 0]
+        kappa = kappa - step
         if np.abs(step).max() < 1e-13 * (1 + np.abs(kappa).max()):
             break
     return kappa
@@ -54,15 +59,15 @@ def shoot(parameters: ArmParameters, solution: ArmSolution, payload: Payload | N
         angle = P.angles[here]
         offsets = segment.r * np.column_stack((np.cos(angle), np.sin(angle), np.zeros(angle.size)))
         gap2 = (segment.L / segment.disks) ** 2 / 24 if P.guides is Guides.DISKS else 0.0
-        guess = [np.zeros(3)]
+        guess = [np.zeros((1, 3))]
 
         def slope(s, y, tau=tau, offsets=offsets, segment=segment, gap2=gap2, guess=guess):
             R, n, m = y[3:12].reshape(3, 3), y[12:15], y[15:18]
-            kappa = guess[0] = _curvature(R.T @ m, tau, offsets, segment.EI, segment.GJ, gap2, guess[0])
+            (kappa,) = guess[0] = curvature((R.T @ m)[None], tau, offsets, segment.EI, segment.GJ, gap2, guess[0])
             strand = np.array([0.0, 0.0, 1.0]) + np.cross(kappa, offsets)
             paths = np.sqrt((strand**2).sum(axis=1)) - 1 - gap2 * (kappa[0] ** 2 + kappa[1] ** 2)
             return np.concatenate(
-                (R[:, 2], (R @ _hat(kappa)).ravel(), -segment.line_mass * g, -np.cross(R[:, 2], n), paths)
+                (R[:, 2], (R @ hat(kappa[None])[0]).ravel(), -segment.line_mass * g, -np.cross(R[:, 2], n), paths)
             )
 
         start = np.concatenate((p, R.ravel(), n, m, longer[here]))

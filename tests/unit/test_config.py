@@ -19,7 +19,7 @@ def write(tmp_path: Path, text: str, name: str = "arm.toml") -> Path:
     return path
 
 
-@pytest.mark.parametrize("name", ["sim.toml", "zhao2022.toml"])
+@pytest.mark.parametrize("name", ["sim.toml", "two_segments.toml", "zhao2022.toml"])
 def test_shipped_files_are_usable(name: str) -> None:
     assert load(name).arm.length_m == 0.25
 

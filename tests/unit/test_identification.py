@@ -1,7 +1,9 @@
 """Fitting a loading test: known parameters come back, intervals cover them, and bad data are refused."""
 
+import dataclasses
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +211,29 @@ def test_too_little_data_and_unknown_names_are_refused(nominal: ArmParameters, e
         ident.fit(nominal, LoadingTest(exact, HANGING), ("EI", "rho"))
 
 
+def changed(readings: tuple[Reading, ...], **values: Callable[[Reading], Any]) -> LoadingTest:
+    return LoadingTest(
+        tuple(dataclasses.replace(r, **{name: value(r) for name, value in values.items()}) for r in readings), HANGING
+    )
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"follower": lambda r: -r.follower},  # outward taken for inward
+        {"follower": lambda r: 0.00981 * r.follower},  # a load column in another unit
+        {"follower": lambda r: 12 * r.follower},
+        {"position": lambda r: r.position[[1, 2, 0]]},  # axes
+    ],
+    ids=["sign", "unit", "large", "axes"],
+)
+def test_data_that_contradict_the_model_give_no_numbers(
+    nominal: ArmParameters, exact: tuple[Reading, ...], wrong: dict[str, Callable[[Reading], Any]]
+) -> None:
+    with pytest.raises(NotIdentifiable, match="check units, signs and axes"):
+        ident.fit(nominal, changed(exact, **wrong), ("EI", "k_T", "T0"))
+
+
 # --- the file and the command ---
 
 HEADER = "run,theta_deg,follower_x_n,x_m,y_m,z_m,tension_1_n,tension_2_n,tension_3_n,tension_4_n"
@@ -242,6 +267,8 @@ def as_csv(test: LoadingTest) -> str:
         ("run,theta_deg,x_m\na,0,0\nb,0,0\na,0,0\n", 4, "goes on after another"),
         ("run,theta_deg,x_m\na,0,0\na,0,64.2\n", 3, "metres?"),
         ("run,theta_deg,tension_1_n\na,0,4\na,0,-4\n", 3, "cannot push"),
+        ("run,theta_deg,tension_1_n\na,0,4\na,0,4100\n", 3, "newtons?"),
+        ("run,theta_deg,force_x_n,x_m\na,0,0,0\na,0,100,0.02\n", 3, "newtons?"),  # grams
     ],
 )
 def test_bad_data_are_refused_with_their_line(text: str, line: int, reason: str) -> None:

@@ -247,7 +247,7 @@ def test_friction_belongs_to_the_equilibrium_it_is_returned_with(mu):
     for force in (0.2, 0.4, 0.8, 0.9, 0.5, 0.1, 0.3):
         solution, grip = friction.step(MODEL, mu, grip, pull, DOWN, (force, 0, 0, 0, 0, 0), start=solution)
         stretch = np.maximum(P.T0 / P.k_T + pull + grip.path, 0.0)
-        drag = grip.z * friction.loss(mu, friction.turning(solution)) * stretch
+        drag = grip.z * friction.loss(mu, solution.detail.turning()) * stretch
         assert np.allclose(pull - solution.pull, drag, rtol=0, atol=1e-9)
         assert np.allclose(grip.path, -solution.detail.path_beyond(0.0), atol=1e-12)
 

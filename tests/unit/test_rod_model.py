@@ -437,3 +437,25 @@ def test_the_compiled_model_gives_the_same_answers():
         a, b = (m.held(pull, hold, g) for m in (MODEL, fast))
         assert np.allclose(a.base_wrench, b.base_wrench, atol=1e-7)
         assert np.allclose(a.tension, b.tension, atol=1e-7)
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_a_straight_arm_that_is_pushed_buckles_in_no_plane_that_the_model_could_know(fast):
+    """The least bend decides; without one every plane is as good, and none is answered."""
+    if fast:
+        pytest.importorskip("numba")
+    model = RodModel(ArmParameters.of(ArmConfig(), Guides.CONTINUOUS), fast=fast)
+    closer = Pose(np.eye(3), np.array((0.0, 0.0, -0.005)))
+    for u in ((0.0, 0.0), (1e-16, 0.0)):
+        pull = model.pull_for_bend(u)
+        hold = model.free(pull, NOTHING).hold(0.25, HoldKind.CLAMPED).seen_from(closer)
+        with pytest.raises(NoSolution):
+            model.held(pull, hold, NOTHING)
+    for delta in (0.3, 2.0):
+        pull = model.pull_for_bend(1e-4 * np.array((math.cos(delta), math.sin(delta))))
+        hold = model.free(pull, NOTHING).hold(0.25, HoldKind.CLAMPED).seen_from(closer)
+        wrench = model.held(pull, hold, NOTHING).base_wrench
+        P = model.parameters
+        assert -wrench[2] == pytest.approx(4 * math.pi**2 * P.EI / P.L**2, rel=0.02)  # Euler's load, and a little
+        across = np.array((math.cos(delta), math.sin(delta)))
+        assert abs(across @ wrench[3:5]) < 1e-6 * np.linalg.norm(wrench[3:5])
