@@ -18,6 +18,7 @@ _JUMP_TICKS = 128.0
 _CLOCK_TOLERANCE_MS = 60.0
 _CLOCK_DRIFT = 0.03
 _CLOCK_MEMORY_S = 8.0  # older comparisons are ambiguous: the servo's clock wraps after 33 s
+_NEVER_HEARD = Feedback(0, 0, 0, 0, 0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +70,7 @@ class ServoRecord:
     tripped: bool = False
     turns_lost: bool = False
     set_up: bool = False
+    firmware: int = 0  # 0: not known yet
     _tick_ms: int = 0
     _tick_at: float = -math.inf
 
@@ -126,7 +128,7 @@ class ServoRecord:
 
     def state(self, now: float, silent_after: int) -> ServoState:
         """The servo's state for the rest of the daemon."""
-        raw = self.feedback or Feedback(0, 0, 0, 0, 0, 0, 0, 0)
+        raw = self.feedback or _NEVER_HEARD
         return ServoState(
             id=self.id,
             position=raw.position,

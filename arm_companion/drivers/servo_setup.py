@@ -10,7 +10,6 @@ from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
 from arm_companion.protocol.control_table import OperatingMode
 
-FIRST_FIRMWARE_WITH_WATCHDOG = 38
 _PING_SIZE = 3
 
 
@@ -51,8 +50,8 @@ async def identify(link: ServoLink, servo: int) -> tuple[int, int]:
     model, firmware = int.from_bytes(data[:2], "little"), data[2]
     if model != ct.MODEL_NUMBER_XL430_W250:
         raise DeviceFault(servo, 0, f"model number {model}, not {ct.MODEL_NUMBER_XL430_W250} (XL430-W250)")
-    if firmware < FIRST_FIRMWARE_WITH_WATCHDOG:
-        raise DeviceFault(servo, 0, f"firmware {firmware} is older than {FIRST_FIRMWARE_WITH_WATCHDOG}: no watchdog")
+    if firmware < ct.FIRST_FIRMWARE_WITH_WATCHDOG:
+        raise DeviceFault(servo, 0, f"firmware {firmware} is older than {ct.FIRST_FIRMWARE_WITH_WATCHDOG}: no watchdog")
     return model, firmware
 
 
@@ -92,6 +91,7 @@ async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> Se
     await link.write(servo, ct.BUS_WATCHDOG, settings.watchdog)
     shutdown = await link.read(servo, ct.SHUTDOWN)
     record.tripped = False
+    record.firmware = firmware
     record.set_up = True
     record.missed = 0
     return ServoInfo(servo, model, firmware, return_delay, shutdown, fresh)
