@@ -90,6 +90,8 @@ class Daemon:
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
+        self._ready = (False,) * len(config.servos.ids)
+        self._recovering: asyncio.Task[None] | None = None
         self._last: Commands | None = None
         self.cycles = 0
         self.missed = 0
@@ -112,6 +114,8 @@ class Daemon:
             )
         finally:
             self._manager.stopping()
+            if self._recovering is not None:
+                self._recovering.cancel()
             action = SAFE_ACTION[self._state.phase]
             log.info("stopping in %s: the arm will %s", self._state.phase.name, action.value)
             try:
@@ -151,6 +155,10 @@ class Daemon:
         if any(servo.tripped for servo in servos) and now >= self._rearm_at:
             self._rearm_at = now + _REARM_EVERY_S
             await self._rearm()
+        ready = tuple(servo.ready for servo in servos)
+        if any(now_ready and not before for now_ready, before in zip(ready, self._ready, strict=True)):
+            self._tendons.rest()  # what follows again starts from where it is, at the tendons' own speed
+        self._ready = ready
         requests, bar = self._component.take()
         self._bar = bar or self._bar
         return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
@@ -166,6 +174,15 @@ class Daemon:
         except* DeviceFault as faults:
             log.error("re-arming: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
 
+    async def _recover(self) -> None:
+        """CLEAR_ERRORS: the cycle goes on meanwhile, and sees in the servos' states what became of it."""
+        try:
+            await self._bus.recover()
+        except* DeviceFault as faults:
+            for fault in faults.exceptions:
+                log.error("clearing errors: %s", fault)  # noqa: TRY400 - a fault of a device, not of the program
+                self._component.notify(Notice(Severity.WARNING, str(fault)))
+
     async def _act(self, commands: Commands, facts: Facts, now: float) -> None:
         """Servos first: they are what a late cycle hurts most."""
         self._last = commands
@@ -176,6 +193,8 @@ class Daemon:
                 await self._bus.limp()
             case _:
                 self._tendons.rest()
+        if commands.recover and (self._recovering is None or self._recovering.done()):
+            self._recovering = asyncio.create_task(self._recover())
         if commands.setpoint is not None:
             self._autopilot.send(commands.setpoint, now)
         for answer in commands.answers:

@@ -141,6 +141,12 @@ class ServosConfig:
         lower=-1_048_575,
         upper=1_048_575,
     )
+    home_window_ticks: int = option(
+        "a servo that was without power is taken to hold its zero when it stands this near to it, whole turns aside",
+        512,
+        lower=0,
+        upper=2048,
+    )
     reply_timeout_s: float = option("deadline of one bus transaction", 0.008, unit="s", lower=0.001, upper=0.5)
     watchdog_s: float = option("servos stop when the bus is silent for", 0.2, unit="s", lower=0.02, upper=2.54)
     silent_after: int = option("missed replies in a row until a servo counts as silent", 10, lower=1, upper=1000)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass, field
 
+from arm_companion.errors import DeviceFault
 from arm_companion.protocol.control_table import (
     LOAD_FULL,
     TICK_CLOCK_MODULUS_MS,
@@ -11,6 +12,7 @@ from arm_companion.protocol.control_table import (
     VOLTAGE_UNIT_V,
     Echo,
     Feedback,
+    HardwareError,
 )
 
 _FASTEST_TICKS_PER_S = 8000.0  # well beyond the 61 rev/min of an unloaded XL430
@@ -38,6 +40,25 @@ class ServoState:
     ready: bool  # set up, and nothing stands in the way of goals
     silent: bool  # has not answered for several cycles, or never
     age_s: float  # since its last answer, inf: never answered
+
+    @property
+    def fault(self) -> DeviceFault | None:
+        """What is wrong with it, the gravest first; None: nothing, or it has not been set up yet."""
+        if self.silent:
+            return DeviceFault(self.id, self.error_bits, "does not answer")
+        if self.error_bits:
+            return DeviceFault(self.id, self.error_bits, hardware_errors(self.error_bits))
+        if self.turns_lost:
+            return DeviceFault(self.id, 0, "has lost its turns: it must be homed")
+        if self.tripped:
+            return DeviceFault(self.id, 0, "its bus watchdog stopped it")
+        return None
+
+
+def hardware_errors(bits: int) -> str:
+    """Hardware-error bits in words."""
+    known = [error.name.lower().replace("_", " ") for error in HardwareError if bits & error and error.name]
+    return ", ".join(known) or "not looked up yet"
 
 
 @dataclass(slots=True)
@@ -71,6 +92,7 @@ class ServoRecord:
     turns_lost: bool = False
     set_up: bool = False
     firmware: int = 0  # 0: not known yet
+    vouched: bool = False  # its LED says that its turns are known
     _tick_ms: int = 0
     _tick_at: float = -math.inf
 
@@ -97,6 +119,11 @@ class ServoRecord:
             if off > _CLOCK_TOLERANCE_MS + _CLOCK_DRIFT * 1000 * elapsed:
                 self.lose_power()
         self._tick_ms, self._tick_at = echo.tick_ms, now
+
+    def rebase(self, position: int) -> None:
+        """The servo counts its ticks from elsewhere now, and stands at `position`."""
+        if self.feedback is not None:
+            self.feedback = self.feedback._replace(position=position)
 
     @property
     def movable(self) -> bool:

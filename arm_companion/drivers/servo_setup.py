@@ -56,7 +56,7 @@ async def identify(link: ServoLink, servo: int) -> tuple[int, int]:
 
 
 async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> ServoInfo:
-    """Prepare one servo for goals; its torque stays as it is, off or on.
+    """Prepare one servo for goals, all but its turns (`servo_homing`); its torque stays as it is, off or on.
 
     EEPROM is written only where it differs and only with the torque off. A tripped bus watchdog is cleared,
     and the servo told to stay where it is before anything can move it.
@@ -92,7 +92,6 @@ async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> Se
     shutdown = await link.read(servo, ct.SHUTDOWN)
     record.tripped = False
     record.firmware = firmware
-    record.set_up = True
     record.missed = 0
     return ServoInfo(servo, model, firmware, return_delay, shutdown, fresh)
 

@@ -360,7 +360,7 @@ def test_a_reboot_ends_a_shutdown_and_the_turns_are_not_assumed() -> None:
         assert not states[2].ready
         assert not states[2].torque
         assert rig.emulator.positions()[2] == pytest.approx(2048, abs=10)
-        rig.bus.accept_position(3)
+        await rig.bus.accept_position(3)
         states = await rig.cycles(100, (2100,) * 4, torque=True)
         assert states[2].position == pytest.approx(2100, abs=10)
         running.cancel()
