@@ -150,6 +150,10 @@ class ServosConfig:
     reply_timeout_s: float = option("deadline of one bus transaction", 0.008, unit="s", lower=0.001, upper=0.5)
     watchdog_s: float = option("servos stop when the bus is silent for", 0.2, unit="s", lower=0.02, upper=2.54)
     silent_after: int = option("missed replies in a row until a servo counts as silent", 10, lower=1, upper=1000)
+    temperature_limit_c: int = option("a servo that is hotter lets go", 72, unit="degC", lower=40, upper=100)
+    voltage_min_v: float = option("a servo reports a supply below", 9.5, unit="V", lower=6.0, upper=14.0)
+    voltage_max_v: float = option("a servo reports a supply above", 14.0, unit="V", lower=6.0, upper=14.0)
+    pwm_limit: float = option("most of the full duty that a servo puts out", 1.0, lower=0.1, upper=1.0)
     load_torque_nm: float = option("torque at 100 % load", 1.4, unit="N m", lower=0.05, upper=50.0)
     load_sigma: float = option("one sigma of the load reading, share of full load", 0.02, lower=0.0, upper=1.0)
     friction_torque_nm: float = option("torque lost in the gear train", 0.05, unit="N m", lower=0.0, upper=5.0)
@@ -163,6 +167,8 @@ class ServosConfig:
                 raise ConfigError(f"{name} has {len(getattr(self, name))} entries for {n} ids")
         if any(d == 0 for d in self.directions):
             raise ConfigError("directions must be +1 or -1")
+        if self.voltage_min_v >= self.voltage_max_v:
+            raise ConfigError(f"voltage_min_v = {self.voltage_min_v:g} is not below {self.voltage_max_v:g}")
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,9 @@ import asyncio
 import logging
 import random
 from collections.abc import Awaitable, Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 from arm_companion.config.schema import ServosConfig
-from arm_companion.drivers.servo_health import ServoCounters, ServoRecord, ServoState
+from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState
 from arm_companion.drivers.servo_homing import adopt, doubt, home
 from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.drivers.servo_reader import ServoReader
@@ -35,17 +34,12 @@ _RECONNECT_FIRST_S = 0.05
 _RECONNECT_LONGEST_S = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class BusCounters:
-    """History of the bus and of each servo on it."""
-
-    servos: dict[int, ServoCounters]
-    frames: int
-    garbage_bytes: int
-    crc_errors: int
-    strays: int
-    reconnects: int
-    latency_s: float  # mean time of a transaction beyond its time on the wire
+def settings_of(config: ServosConfig, speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S) -> Settings:
+    """What every servo of a configuration is set to."""
+    return Settings(
+        watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
+        profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
+    )
 
 
 class ServoBus:
@@ -74,10 +68,7 @@ class ServoBus:
         self._records = tuple(ServoRecord(servo, config.silent_after) for servo in config.ids)
         self._by_id = {record.id: record for record in self._records}
         self._zeros = dict(zip(config.ids, config.zero_ticks, strict=True))
-        self._settings = Settings(
-            watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
-            profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
-        )
+        self._settings = settings_of(config, speed_limit_rad_per_s)
         self._reader = ServoReader(self._link, self._records, config, self._settings)
         self._transport: Transport | None = None
         self._opening = asyncio.Lock()
@@ -361,16 +352,7 @@ class ServoBus:
 
     def counters(self) -> BusCounters:
         """History of the bus, for telemetry."""
-        parser = self._link.parser
-        return BusCounters(
-            servos={r.id: r.counters for r in self._records},
-            frames=parser.frames,
-            garbage_bytes=parser.garbage,
-            crc_errors=parser.crc_errors,
-            strays=self._link.strays,
-            reconnects=self.reconnects,
-            latency_s=self._link.latency.mean_s,
-        )
+        return BusCounters.of(self._link, self._records, self.reconnects)
 
 
 def _fault(record: ServoRecord, otherwise: str) -> DeviceFault:

@@ -1,8 +1,11 @@
 """What is known of one servo: its last answer, its faults, and the history that telemetry shows."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Self
 
+from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.errors import DeviceFault
 from arm_companion.protocol.control_table import (
     LOAD_FULL,
@@ -170,4 +173,31 @@ class ServoRecord:
             ready=self.movable and not self.error_bits,
             silent=self.missed >= silent_after,
             age_s=now - self.answered_at,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class BusCounters:
+    """History of the bus and of each servo on it."""
+
+    servos: dict[int, ServoCounters]
+    frames: int
+    garbage_bytes: int
+    crc_errors: int
+    strays: int
+    reconnects: int
+    latency_s: float  # mean time of a transaction beyond its time on the wire
+
+    @classmethod
+    def of(cls, link: ServoLink, records: Iterable[ServoRecord], reconnects: int = 0) -> Self:
+        """What link and records have counted."""
+        parser = link.parser
+        return cls(
+            servos={r.id: r.counters for r in records},
+            frames=parser.frames,
+            garbage_bytes=parser.garbage,
+            crc_errors=parser.crc_errors,
+            strays=link.strays,
+            reconnects=reconnects,
+            latency_s=link.latency.mean_s,
         )

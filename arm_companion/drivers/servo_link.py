@@ -55,6 +55,7 @@ class ServoLink:
     Attributes:
         latency: beyond the time on the wire, learnt from complete transactions.
         strays: status frames that nobody waited for.
+        timeout_s: longest wait for the answer to one request.
     """
 
     def __init__(self, baud: int, timeout_s: float) -> None:
@@ -63,7 +64,7 @@ class ServoLink:
         self.parser = dxl.Parser()
         self.strays = 0
         self._byte_s = _BITS_PER_BYTE / baud
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
         self._return_delays: dict[int, float] = {}
         self._transport: Transport | None = None
         self._lock = asyncio.Lock()
@@ -183,7 +184,7 @@ class ServoLink:
         for attempt in range(tries):
             if attempt:
                 await asyncio.sleep(DRAIN_S)
-            deadline = asyncio.get_running_loop().time() + self._timeout_s
+            deadline = asyncio.get_running_loop().time() + self.timeout_s
             answers = await self.ask(request, (servo,), size, deadline)
             if servo in answers:
                 refusal = answers[servo].error & ~dxl.ALERT

@@ -183,8 +183,7 @@ class EmulatedBus:
 
     def _receive(self, data: bytes) -> None:
         now = asyncio.get_running_loop().time()
-        set_by_peer = self._transport.baud if isinstance(self._transport, PtyTransport) else None
-        baud = set_by_peer or self._baud
+        baud = self._transport.baud if isinstance(self._transport, PtyTransport) else self._baud
         byte_s = _BITS_PER_BYTE / baud
         end = max(now, self._line_free_at) + len(data) * byte_s
         for delay, answer in self.emulator.respond(self.to_servos(data), baud):

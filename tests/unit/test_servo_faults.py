@@ -76,7 +76,7 @@ class Arm:
         assert all(fault is None or isinstance(fault, DeviceFault) for fault in found)
         return {fault.servo: fault.bits for fault in found if fault is not None}
 
-    def at(self, goal: int, servos: set[int], tolerance: float = 12.0) -> bool:
+    def at(self, goal: float, servos: set[int], tolerance: float = 12.0) -> bool:
         return all(abs(self.emulator[i].motor.position - goal) < tolerance for i in servos)
 
 
@@ -228,8 +228,8 @@ def test_turns_that_were_lost_with_the_power_are_found_again_only_when_told(turn
         assert arm.faults() == dict.fromkeys(ALL, 0)
         assert all(state.turns_lost and not state.ready for state in arm.states)
         assert arm.at(HOME + turned, ALL), "nothing moved"
-        for servo in arm.config.ids:
-            await arm.bus.accept_position(servo, round(HOME + turned))
+        for i in arm.config.ids:
+            await arm.bus.accept_position(i, round(HOME + turned))
         await arm.run(1.0, round(HOME + turned))
         assert arm.faults() == {}
         assert [state.position for state in arm.states] == pytest.approx([HOME + turned] * 4, abs=20)
