@@ -16,6 +16,7 @@ from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
+from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.tendons import Tendons
 from arm_companion.errors import ConfigError, DeviceFault
@@ -85,6 +86,7 @@ class Daemon:
         self._autopilot = Autopilot(autopilot_link, config.vehicle)
         self._component = Component(self._links, config.vehicle, clock)
         self._telemetry = Telemetry(self._links, config.rates, clock)
+        self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
         self._bus = ServoBus(openers.servos, config.servos)
         self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
         self._state = State()
@@ -159,6 +161,7 @@ class Daemon:
         if any(now_ready and not before for now_ready, before in zip(ready, self._ready, strict=True)):
             self._tendons.rest()  # what follows again starts from where it is, at the tendons' own speed
         self._ready = ready
+        self._servo_telemetry.publish(now, servos, self._bus.counters)
         requests, bar = self._component.take()
         self._bar = bar or self._bar
         return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)

@@ -262,6 +262,7 @@ class RatesConfig:
     cycle_hz: float = option("observe-step-act-record", 100.0, unit="Hz", lower=10.0, upper=500.0)
     status_hz: float = option("ARM_STATUS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     tendons_hz: float = option("ARM_TENDONS", 10.0, unit="Hz", lower=0.0, upper=100.0)
+    servos_hz: float = option("ARM_SERVOS", 1.0, unit="Hz", lower=0.0, upper=100.0)
     wrench_hz: float = option("ARM_REACTION_WRENCH", 20.0, unit="Hz", lower=0.0, upper=200.0)
 
 
