@@ -13,7 +13,7 @@ def test_every_servo_has_its_place_and_counters_stop_at_the_end_of_their_field()
     servos[1] = dataclasses.replace(servos[1], ready=False, turns_lost=True)
     servos[4] = dataclasses.replace(servos[4], ready=False, tripped=True)
     counted = {s.id: ServoCounters(lost=s.id, missed_cycles=1, goals_lost=70_000, power_losses=300) for s in servos}
-    counters = BusCounters(counted, 2**33, 7, 8, 9, 70_000, 0.00035)
+    counters = BusCounters(counted, 2**33, 8, 7, 9, 70_000, 0.00035)
     first, second = servo_messages(1_000_000, servos, counters)
     assert (first.first, first.count, second.first, second.count) == (0, 4, 4, 2)
     assert (list(first.id), list(second.id)) == ([10, 11, 12, 13], [14, 15, 0, 0])
