@@ -24,12 +24,13 @@ demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated 
 	@$(BIN)/arm-companion sim perch --output build/demo
 
 test: $(STAMP)  ## run the tests
-	@$(BIN)/python -m pytest -m 'not scenario'
+	@$(BIN)/python -m pytest -m 'not scenario and not soak'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
 	@$(BIN)/python -m pytest -m scenario
 
-soak: $(STAMP)  ## ask the mechanics 10,000 random questions, none to be answered wrong and silent (ten minutes)
+soak: $(STAMP)  ## ten minutes of bus in simulated time, and 10,000 random questions to the mechanics, none answered wrong
+	@$(BIN)/python -m pytest -m soak
 	@$(BIN)/python -m tests.soak
 
 check: $(STAMP)  ## lint, format, types and dependency directions

@@ -13,6 +13,7 @@ _COMMANDS = {
     "sim": "fly a scenario in the simulated world with the real daemon",
     "model": "the arm's mechanics: one equilibrium, or the paper's experiments",
     "calibrate": "fit the model to measurements",
+    "servos": "find, set up and watch the servos",
     "config": "check or show a configuration",
 }
 

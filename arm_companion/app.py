@@ -17,6 +17,7 @@ from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
+from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.tendons import Tendons
 from arm_companion.errors import ConfigError, DeviceFault
@@ -27,8 +28,7 @@ from arm_companion.mission.state import MOVES_VEHICLE, State
 from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
-from arm_companion.transport.serial import open_serial
-from arm_companion.transport.urls import open_url
+from arm_companion.transport.urls import open_bus, open_url
 
 log = logging.getLogger(__name__)
 
@@ -55,11 +55,11 @@ def open_configured(config: Config) -> Openers:
     """The real transports that a configuration names.
 
     Raises:
-        ConfigError: a link's URL cannot be read.
+        ConfigError: the URL of a link or of the servo bus cannot be read.
     """
     return Openers(
         {name: open_url(link.url) for name, link in config.links.items()},
-        open_serial(config.servos.port, config.servos.baud),
+        open_bus(config.servos.port, config.servos.baud),
     )
 
 
@@ -94,11 +94,14 @@ class Daemon:
         self._autopilot = Autopilot(autopilot_link, config.vehicle)
         self._component = Component(self._links, config.vehicle, clock)
         self._telemetry = Telemetry(self._links, config.rates, clock)
+        self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
         self._bus = ServoBus(openers.servos, config.servos)
         self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
+        self._ready = (False,) * len(config.servos.ids)
+        self._recovering: asyncio.Task[None] | None = None
         self._last: Commands | None = None
         self.cycles = 0
         self.missed = 0
@@ -121,6 +124,8 @@ class Daemon:
             )
         finally:
             self._manager.stopping()
+            if self._recovering is not None:
+                self._recovering.cancel()
             action = SAFE_ACTION[self._state.phase]
             log.info("stopping in %s: the arm will %s", self._state.phase.name, action.value)
             try:
@@ -183,6 +188,11 @@ class Daemon:
         if any(servo.tripped for servo in servos) and now >= self._rearm_at:
             self._rearm_at = now + _REARM_EVERY_S
             await self._rearm()
+        ready = tuple(servo.ready for servo in servos)
+        if any(now_ready and not before for now_ready, before in zip(ready, self._ready, strict=True)):
+            self._tendons.rest()  # what follows again starts from where it is, at the tendons' own speed
+        self._ready = ready
+        self._servo_telemetry.publish(now, servos, self._bus.counters)
         requests, bar = self._component.take()
         self._bar = bar or self._bar
         return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
@@ -198,6 +208,15 @@ class Daemon:
         except* DeviceFault as faults:
             log.error("re-arming: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
 
+    async def _recover(self) -> None:
+        """CLEAR_ERRORS: the cycle goes on meanwhile, and sees in the servos' states what became of it."""
+        try:
+            await self._bus.recover()
+        except* DeviceFault as faults:
+            for fault in faults.exceptions:
+                log.error("clearing errors: %s", fault)  # noqa: TRY400 - a fault of a device, not of the program
+                self._component.notify(Notice(Severity.WARNING, str(fault)))
+
     async def _act(self, commands: Commands, facts: Facts, now: float) -> None:
         """Servos first: they are what a late cycle hurts most."""
         self._last = commands
@@ -208,6 +227,8 @@ class Daemon:
                 await self._bus.limp()
             case _:
                 self._tendons.rest()
+        if commands.recover and (self._recovering is None or self._recovering.done()):
+            self._recovering = asyncio.create_task(self._recover())
         if commands.setpoint is not None:
             self._autopilot.send(commands.setpoint, now)
         for answer in commands.answers:

@@ -30,7 +30,8 @@ class DeviceFault(ArmError):
     def __init__(self, servo: int, bits: int, detail: str = "") -> None:
         self.servo = servo
         self.bits = bits
-        super().__init__(f"servo {servo}: error bits 0x{bits:02x}{': ' + detail if detail else ''}")
+        error = f"hardware error 0x{bits:02x}" if bits or not detail else ""
+        super().__init__(f"servo {servo}: {': '.join(filter(None, (error, detail)))}")
 
 
 class ModelError(ArmError):

@@ -161,7 +161,7 @@ class VehicleConfig:
 class LinkConfig:
     """[links.NAME] One MAVLink connection."""
 
-    url: str = option("udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD")
+    url: str = option("udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD")
     role: str = option("who is at the other end", "ground", choices=("autopilot", "ground"))
 
 
@@ -169,7 +169,7 @@ class LinkConfig:
 class ServosConfig:
     """[servos] The Dynamixel bus and what each servo pulls."""
 
-    port: str = option("serial device of the bus", "/dev/ttyUSB0")
+    port: str = option("serial device of the bus, or tcp:HOST:PORT of a bridge to it", "/dev/ttyUSB0")
     baud: int = option("bits per second", 1_000_000, lower=9600, upper=4_500_000)
     ids: tuple[int, ...] = option("servo id of each tendon, in the tendons' order", (1, 2, 3, 4), lower=0, upper=252)
     directions: tuple[int, ...] = option(
@@ -181,9 +181,19 @@ class ServosConfig:
         lower=-1_048_575,
         upper=1_048_575,
     )
+    home_window_ticks: int = option(
+        "a servo that was without power is taken to hold its zero when it stands this near to it, whole turns aside",
+        512,
+        lower=0,
+        upper=2048,
+    )
     reply_timeout_s: float = option("deadline of one bus transaction", 0.008, unit="s", lower=0.001, upper=0.5)
     watchdog_s: float = option("servos stop when the bus is silent for", 0.2, unit="s", lower=0.02, upper=2.54)
     silent_after: int = option("missed replies in a row until a servo counts as silent", 10, lower=1, upper=1000)
+    temperature_limit_c: int = option("a servo that is hotter lets go", 72, unit="degC", lower=40, upper=100)
+    voltage_min_v: float = option("a servo reports a supply below", 9.5, unit="V", lower=6.0, upper=14.0)
+    voltage_max_v: float = option("a servo reports a supply above", 14.0, unit="V", lower=6.0, upper=14.0)
+    pwm_limit: float = option("most of the full duty that a servo puts out", 1.0, lower=0.1, upper=1.0)
     load_torque_nm: float = option("torque at 100 % load", 1.4, unit="N m", lower=0.05, upper=50.0)
     load_sigma: float = option("one sigma of the load reading, share of full load", 0.02, lower=0.0, upper=1.0)
     friction_torque_nm: float = option("torque lost in the gear train", 0.05, unit="N m", lower=0.0, upper=5.0)
@@ -197,6 +207,8 @@ class ServosConfig:
                 raise ConfigError(f"{name} has {len(getattr(self, name))} entries for {n} ids")
         if any(d == 0 for d in self.directions):
             raise ConfigError("directions must be +1 or -1")
+        if self.voltage_min_v >= self.voltage_max_v:
+            raise ConfigError(f"voltage_min_v = {self.voltage_min_v:g} is not below {self.voltage_max_v:g}")
 
 
 @dataclass(frozen=True)
@@ -297,6 +309,7 @@ class RatesConfig:
     cycle_hz: float = option("observe-step-act-record", 100.0, unit="Hz", lower=10.0, upper=500.0)
     status_hz: float = option("ARM_STATUS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     tendons_hz: float = option("ARM_TENDONS", 10.0, unit="Hz", lower=0.0, upper=100.0)
+    servos_hz: float = option("ARM_SERVOS", 1.0, unit="Hz", lower=0.0, upper=100.0)
     wrench_hz: float = option("ARM_REACTION_WRENCH", 20.0, unit="Hz", lower=0.0, upper=200.0)
 
 

@@ -9,10 +9,10 @@ import asyncio
 import logging
 import random
 from collections.abc import Awaitable, Callable, Iterable, Sequence
-from dataclasses import dataclass
 
 from arm_companion.config.schema import ServosConfig
-from arm_companion.drivers.servo_health import ServoCounters, ServoRecord, ServoState
+from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState
+from arm_companion.drivers.servo_homing import adopt, doubt, home
 from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.drivers.servo_reader import ServoReader
 from arm_companion.drivers.servo_setup import ServoInfo, Settings, set_up
@@ -28,22 +28,18 @@ SPEED_LIMIT_RAD_PER_S = 6.0
 
 _CHECK_S = 0.25  # between attempts to set up a servo that is not
 _TORQUE_RETRY_S = 0.2
+_BOOT_TRIES = 6
 _TRIES = 4
 _RECONNECT_FIRST_S = 0.05
 _RECONNECT_LONGEST_S = 2.0
 
 
-@dataclass(frozen=True, slots=True)
-class BusCounters:
-    """History of the bus and of each servo on it."""
-
-    servos: dict[int, ServoCounters]
-    frames: int
-    garbage_bytes: int
-    crc_errors: int
-    strays: int
-    reconnects: int
-    latency_s: float  # mean time of a transaction beyond its time on the wire
+def settings_of(config: ServosConfig, speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S) -> Settings:
+    """What every servo of a configuration is set to."""
+    return Settings(
+        watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
+        profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
+    )
 
 
 class ServoBus:
@@ -71,13 +67,12 @@ class ServoBus:
         self._link = ServoLink(config.baud, config.reply_timeout_s)
         self._records = tuple(ServoRecord(servo, config.silent_after) for servo in config.ids)
         self._by_id = {record.id: record for record in self._records}
-        self._settings = Settings(
-            watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
-            profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
-        )
+        self._zeros = dict(zip(config.ids, config.zero_ticks, strict=True))
+        self._settings = settings_of(config, speed_limit_rad_per_s)
         self._reader = ServoReader(self._link, self._records, config, self._settings)
         self._transport: Transport | None = None
         self._opening = asyncio.Lock()
+        self._setting_up = asyncio.Lock()
         self._next_torque_at = 0.0
         self._last_reported: dict[int, str] = {}
         self.info: dict[int, ServoInfo] = {}
@@ -162,17 +157,25 @@ class ServoBus:
     async def _keep_set_up(self) -> None:
         while True:
             for record in self._records:
-                if not record.set_up:
-                    try:
+                try:
+                    if not record.set_up:
                         await self._set_up(record)
-                    except DeviceFault as fault:
-                        self._report(record.id, str(fault))
-                    else:
-                        self._report(record.id, "")
+                    elif record.turns_lost and record.vouched:
+                        await doubt(self._link, record)
+                except DeviceFault as fault:
+                    self._report(record.id, str(fault))
+                else:
+                    lost = "its turns are not known: it must be homed" if record.turns_lost else ""
+                    self._report(record.id, lost)
             await asyncio.sleep(_CHECK_S)
 
     async def _set_up(self, record: ServoRecord) -> None:
-        self.info[record.id] = await set_up(self._link, record, self._settings)
+        async with self._setting_up:
+            info = await set_up(self._link, record, self._settings)
+            if record.id not in self.info:
+                await adopt(self._link, record, self._zeros[record.id], self._config.home_window_ticks)
+            self.info[record.id] = info
+            record.set_up = True
 
     def _report(self, servo: int, trouble: str) -> None:
         """Log what is wrong once, and once that it is over."""
@@ -300,26 +303,56 @@ class ServoBus:
         record.lose_power()
         record.error_bits = 0
 
-    def accept_position(self, servo: int) -> None:
-        """Trust a servo's position again, once its tendon has been homed.
+    async def accept_position(self, servo: int, near: int | None = None) -> None:
+        """Trust a servo's position again: somebody knows that its tendon is where it should be.
+
+        Args:
+            servo: its torque must be off.
+            near: ticks, within half a turn of which its horn is; None: its configured zero, with the arm
+                hanging straight.
 
         Raises:
+            DeviceFault: it is silent, refuses, or its torque is on.
             KeyError: no servo of the arm has this id.
         """
-        self._by_id[servo].turns_lost = False
+        async with self._setting_up:
+            await home(self._link, self._by_id[servo], self._zeros[servo] if near is None else near)
+
+    async def recover(self) -> None:
+        """Bring back what can be brought back, at the word of somebody who sees the arm hang straight.
+
+        Servos with a hardware error are rebooted, watchdog trips cleared, and servos that lost their turns
+        accepted near their zeros. One that is well is not touched. All are tried whatever happens to one.
+
+        Raises:
+            ExceptionGroup: of one `DeviceFault` for each servo that could not be brought back.
+        """
+        await self._for_each("recover", self._records, self._recover)
+
+    async def _recover(self, record: ServoRecord) -> None:
+        if record.error_bits:
+            await self.reboot(record.id)
+            await self._await_boot(record)
+        if record.tripped or not record.set_up:
+            await self._set_up(record)
+        if record.turns_lost:
+            await self.accept_position(record.id)
+
+    async def _await_boot(self, record: ServoRecord) -> None:
+        """Return once a servo answers again, or after as long as that may take."""
+        for _ in range(_BOOT_TRIES):
+            await asyncio.sleep(_CHECK_S)
+            if record.set_up:
+                return
+            try:
+                await self._set_up(record)
+            except DeviceFault as fault:
+                if fault.bits:
+                    raise
 
     def counters(self) -> BusCounters:
         """History of the bus, for telemetry."""
-        parser = self._link.parser
-        return BusCounters(
-            servos={r.id: r.counters for r in self._records},
-            frames=parser.frames,
-            garbage_bytes=parser.garbage,
-            crc_errors=parser.crc_errors,
-            strays=self._link.strays,
-            reconnects=self.reconnects,
-            latency_s=self._link.latency.mean_s,
-        )
+        return BusCounters.of(self._link, self._records, self.reconnects)
 
 
 def _fault(record: ServoRecord, otherwise: str) -> DeviceFault:

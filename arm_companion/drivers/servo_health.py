@@ -1,8 +1,12 @@
 """What is known of one servo: its last answer, its faults, and the history that telemetry shows."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Self
 
+from arm_companion.drivers.servo_link import ServoLink
+from arm_companion.errors import DeviceFault
 from arm_companion.protocol.control_table import (
     LOAD_FULL,
     TICK_CLOCK_MODULUS_MS,
@@ -11,6 +15,7 @@ from arm_companion.protocol.control_table import (
     VOLTAGE_UNIT_V,
     Echo,
     Feedback,
+    HardwareError,
 )
 
 _FASTEST_TICKS_PER_S = 8000.0  # well beyond the 61 rev/min of an unloaded XL430
@@ -18,6 +23,7 @@ _JUMP_TICKS = 128.0
 _CLOCK_TOLERANCE_MS = 60.0
 _CLOCK_DRIFT = 0.03
 _CLOCK_MEMORY_S = 8.0  # older comparisons are ambiguous: the servo's clock wraps after 33 s
+_NEVER_HEARD = Feedback(0, 0, 0, 0, 0, 0, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +43,25 @@ class ServoState:
     ready: bool  # set up, and nothing stands in the way of goals
     silent: bool  # has not answered for several cycles, or never
     age_s: float  # since its last answer, inf: never answered
+
+    @property
+    def fault(self) -> DeviceFault | None:
+        """What is wrong with it, the gravest first; None: nothing, or it has not been set up yet."""
+        if self.silent:
+            return DeviceFault(self.id, self.error_bits, "does not answer")
+        if self.error_bits:
+            return DeviceFault(self.id, self.error_bits, hardware_errors(self.error_bits))
+        if self.turns_lost:
+            return DeviceFault(self.id, 0, "has lost its turns: it must be homed")
+        if self.tripped:
+            return DeviceFault(self.id, 0, "its bus watchdog stopped it")
+        return None
+
+
+def hardware_errors(bits: int) -> str:
+    """Hardware-error bits in words."""
+    known = [error.name.lower().replace("_", " ") for error in HardwareError if bits & error and error.name]
+    return ", ".join(known) or "not looked up yet"
 
 
 @dataclass(slots=True)
@@ -69,6 +94,8 @@ class ServoRecord:
     tripped: bool = False
     turns_lost: bool = False
     set_up: bool = False
+    firmware: int = 0  # 0: not known yet
+    vouched: bool = False  # its LED says that its turns are known
     _tick_ms: int = 0
     _tick_at: float = -math.inf
 
@@ -95,6 +122,11 @@ class ServoRecord:
             if off > _CLOCK_TOLERANCE_MS + _CLOCK_DRIFT * 1000 * elapsed:
                 self.lose_power()
         self._tick_ms, self._tick_at = echo.tick_ms, now
+
+    def rebase(self, position: int) -> None:
+        """The servo counts its ticks from elsewhere now, and stands at `position`."""
+        if self.feedback is not None:
+            self.feedback = self.feedback._replace(position=position)
 
     @property
     def movable(self) -> bool:
@@ -126,7 +158,7 @@ class ServoRecord:
 
     def state(self, now: float, silent_after: int) -> ServoState:
         """The servo's state for the rest of the daemon."""
-        raw = self.feedback or Feedback(0, 0, 0, 0, 0, 0, 0, 0)
+        raw = self.feedback or _NEVER_HEARD
         return ServoState(
             id=self.id,
             position=raw.position,
@@ -141,4 +173,31 @@ class ServoRecord:
             ready=self.movable and not self.error_bits,
             silent=self.missed >= silent_after,
             age_s=now - self.answered_at,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class BusCounters:
+    """History of the bus and of each servo on it."""
+
+    servos: dict[int, ServoCounters]
+    frames: int
+    garbage_bytes: int
+    crc_errors: int
+    strays: int
+    reconnects: int
+    latency_s: float  # mean time of a transaction beyond its time on the wire
+
+    @classmethod
+    def of(cls, link: ServoLink, records: Iterable[ServoRecord], reconnects: int = 0) -> Self:
+        """What link and records have counted."""
+        parser = link.parser
+        return cls(
+            servos={r.id: r.counters for r in records},
+            frames=parser.frames,
+            garbage_bytes=parser.garbage,
+            crc_errors=parser.crc_errors,
+            strays=link.strays,
+            reconnects=reconnects,
+            latency_s=link.latency.mean_s,
         )

@@ -7,7 +7,7 @@ of `servo_bus`.
 import asyncio
 from collections.abc import Sequence
 
-from arm_companion.errors import DeviceFault
+from arm_companion.errors import DeviceFault, ProtocolError
 from arm_companion.protocol import dynamixel as dxl
 from arm_companion.protocol.control_table import RETURN_DELAY_UNIT_S, Register
 from arm_companion.protocol.dynamixel import Packet
@@ -55,6 +55,7 @@ class ServoLink:
     Attributes:
         latency: beyond the time on the wire, learnt from complete transactions.
         strays: status frames that nobody waited for.
+        timeout_s: longest wait for the answer to one request.
     """
 
     def __init__(self, baud: int, timeout_s: float) -> None:
@@ -63,7 +64,7 @@ class ServoLink:
         self.parser = dxl.Parser()
         self.strays = 0
         self._byte_s = _BITS_PER_BYTE / baud
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
         self._return_delays: dict[int, float] = {}
         self._transport: Transport | None = None
         self._lock = asyncio.Lock()
@@ -71,6 +72,7 @@ class ServoLink:
         self._waiting: asyncio.Future[None] | None = None
         self._wanted: Sequence[int] = ()
         self._size = 0
+        self._fast = False
         self._answers: dict[int, Packet] = {}
         self._owed: dict[int, float] = {}  # when an answer that has not come should have ended
 
@@ -98,6 +100,9 @@ class ServoLink:
         for packet in self.parser.feed(data):
             if packet.instruction != dxl.Instruction.STATUS:
                 continue  # our own request, which some adapters echo
+            if packet.id == dxl.BROADCAST_ID:
+                self._take_fast(packet)
+                continue
             fits = len(packet.parameters) == self._size or packet.error & ~dxl.ALERT
             if self._waiting is None or packet.id not in self._wanted or not fits:
                 self.strays += 1
@@ -108,7 +113,21 @@ class ServoLink:
             if packet.id == self._wanted[-1]:
                 self._finish()
 
-    async def ask(self, request: bytes, servos: Sequence[int], size: int, deadline: float) -> dict[int, Packet]:
+    def _take_fast(self, packet: Packet) -> None:
+        """The one answer of all servos to a Fast Sync Read."""
+        try:
+            answers = dxl.split_fast_sync_answer(packet, self._size) if self._fast and self._waiting else []
+        except ProtocolError:
+            answers = []
+        if [answer.id for answer in answers] != list(self._wanted):
+            self.strays += 1
+            return
+        self._answers = {answer.id: answer for answer in answers}
+        self._finish()
+
+    async def ask(
+        self, request: bytes, servos: Sequence[int], size: int, deadline: float, *, fast: bool = False
+    ) -> dict[int, Packet]:
         """Send `request`; answers by servo id, without those that did not come in time.
 
         Args:
@@ -116,17 +135,19 @@ class ServoLink:
             servos: who has to answer, in the order in which they will.
             size: bytes of data in each answer.
             deadline: loop time at which to stop waiting whatever the wire would still allow.
+            fast: the request is a Fast Sync Read, which all servos answer in one frame.
         """
         async with self._lock:
             loop = asyncio.get_running_loop()
             begin = loop.time()
-            wire = self._end_of_line(begin, len(request) + len(servos) * (size + dxl.STATUS_OVERHEAD))
+            answer = dxl.fast_sync_size(len(servos), size) if fast else len(servos) * (size + dxl.STATUS_OVERHEAD)
+            wire = self._end_of_line(begin, len(request) + answer)
             for servo in servos:
                 wire += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
             if self._transport is None or not servos or wire > deadline:
                 return {}
             self.parser.reset()
-            self._wanted, self._size, self._answers = servos, size, {}
+            self._wanted, self._size, self._fast, self._answers = servos, size, fast, {}
             self._waiting = loop.create_future()
             self._transport.write(request)
             timer = loop.call_at(min(wire + self.latency.margin_s, deadline), self._finish)
@@ -163,7 +184,7 @@ class ServoLink:
         for attempt in range(tries):
             if attempt:
                 await asyncio.sleep(DRAIN_S)
-            deadline = asyncio.get_running_loop().time() + self._timeout_s
+            deadline = asyncio.get_running_loop().time() + self.timeout_s
             answers = await self.ask(request, (servo,), size, deadline)
             if servo in answers:
                 refusal = answers[servo].error & ~dxl.ALERT

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import ServoRecord
@@ -16,6 +16,8 @@ _RETRIES = 3
 _PROBE_S = 0.05  # between attempts to hear each silent servo
 _AUDIT_S = 0.08
 _SHORTEST_BOOT_S = 0.05  # no servo is back sooner after losing its power
+_SLOW_READS = 100
+_FAST = ct.FIRST_FIRMWARE_WITH_FAST_SYNC_READ
 _STATUS = (ct.TORQUE_ENABLE.address, ct.HARDWARE_ERROR_STATUS.address + 1 - ct.TORQUE_ENABLE.address)
 _WATCHDOG = (ct.BUS_WATCHDOG.address, ct.BUS_WATCHDOG.size)
 _ECHO = (ct.ECHO_ADDRESS, ct.ECHO_SIZE)
@@ -40,7 +42,8 @@ class ServoReader:
         self._explained_at: dict[int, float] = {}
         self._probes = 0
         self._next_probe_at = 0.0
-        self._requests: dict[tuple[int, ...], bytes] = {}
+        self._requests: dict[tuple[bool, int, int, tuple[int, ...]], bytes] = {}
+        self._slow_for = 0  # Sync Reads until the next fast one is tried
         self._next_audit_at = 0.0
         self._audits = deque((self.check_torque, self.check_watchdog, self.check_goals))
 
@@ -58,9 +61,15 @@ class ServoReader:
             await self._repair(answers, present, deadline)
         for record in self._records:
             packet = answers.get(record.id)
-            if packet is None or not await self._accept(record, packet, deadline):
+            if packet is None or (self._doubts(record) and not await self._explain(record, deadline)):
                 record.missed += 1
                 record.counters.missed_cycles += 1
+                continue
+            record.take(ct.decode_feedback(packet.parameters), asyncio.get_running_loop().time())
+            if packet.error & dxl.ALERT:
+                await self._take_alert(record, deadline)
+            else:
+                record.error_bits = 0
 
     async def _look_aside(self, now: float, deadline: float) -> dict[int, Packet]:
         """Do at most one of the things that a cycle alone does not show, before the cycle's own read.
@@ -83,30 +92,36 @@ class ServoReader:
             await self._audits[0]([r for r in self._records if not r.missed], deadline)
         return {}
 
-    async def _repair(self, answers: dict[int, Packet], present: Iterable[ServoRecord], deadline: float) -> None:
-        """Ask those one by one whose answers did not come."""
+    async def _repair(self, answers: dict[int, Packet], present: Sequence[ServoRecord], deadline: float) -> None:
+        """Ask those one by one whose answers did not come.
+
+        Where the chain of answers broke off, the first that is missing is the likeliest to be dead: it comes last.
+        """
         for _ in range(_RETRIES):
-            for record in [r for r in present if r.id not in answers]:
+            missing = [r for r in present if r.id not in answers]
+            suspects = 1 if answers else 0
+            for record in missing[suspects:] + missing[:suspects]:
                 record.counters.lost += 1
                 answers |= await self._ask_one(record, *_FEEDBACK, deadline)
 
-    async def _accept(self, record: ServoRecord, packet: Packet, deadline: float) -> bool:
-        """Take what a servo measured; False if a gap before it could not be explained."""
-        now = asyncio.get_running_loop().time()
+    def _doubts(self, record: ServoRecord) -> bool:
+        """Whether a servo that answers was away for so long that it may have started afresh."""
         known_at = max(record.answered_at, self._explained_at.get(record.id, 0.0))
-        gap = record.missed and record.set_up and now - known_at > _SHORTEST_BOOT_S
-        if gap and not await self._explain_gap(record, deadline):
-            self._doubtful.add(record.id)
-            return False
-        record.take(ct.decode_feedback(packet.parameters), now)
-        if packet.error & dxl.ALERT:
-            record.counters.alerts += 1
-            if record.error_bits in {0, _ERROR_NOT_READ}:
-                record.error_bits = _ERROR_NOT_READ
-                await self.check_torque([record], deadline)
-        else:
-            record.error_bits = 0
-        return True
+        return bool(record.missed and record.set_up and asyncio.get_running_loop().time() - known_at > _SHORTEST_BOOT_S)
+
+    async def _explain(self, record: ServoRecord, deadline: float) -> bool:
+        """Explain a gap now, or remember to do so."""
+        if await self._explain_gap(record, deadline):
+            return True
+        self._doubtful.add(record.id)
+        return False
+
+    async def _take_alert(self, record: ServoRecord, deadline: float) -> None:
+        """A servo says that a hardware error stands: look it up in the same cycle."""
+        record.counters.alerts += 1
+        if record.error_bits in {0, _ERROR_NOT_READ}:
+            record.error_bits = _ERROR_NOT_READ
+            await self.check_torque([record], deadline)
 
     async def _explain_gap(self, record: ServoRecord, deadline: float) -> bool:
         """Find out whether a servo that was not heard for a while lost power or was stopped meanwhile."""
@@ -149,12 +164,23 @@ class ServoReader:
     async def _ask_all(
         self, records: Sequence[ServoRecord], address: int, size: int, deadline: float
     ) -> dict[int, Packet]:
-        servos = tuple(r.id for r in records)
-        key = (address, size, *servos)
+        servos = tuple([r.id for r in records])
+        fast = self._slow_for == 0 and len(servos) > 1 and min([r.firmware for r in records]) >= _FAST
+        request = self._request(address, size, servos, fast=fast)
+        answers = await self._link.ask(request, servos, size, deadline, fast=fast)
+        if fast and not answers:
+            # One lost byte costs the whole frame: a noisy bus gets further with a frame from each servo.
+            self._slow_for = _SLOW_READS
+        elif self._slow_for:
+            self._slow_for -= 1
+        return _whole(answers, size)
+
+    def _request(self, address: int, size: int, servos: tuple[int, ...], *, fast: bool) -> bytes:
+        key = (fast, address, size, servos)
         request = self._requests.get(key)
         if request is None:
-            request = self._requests[key] = dxl.sync_read(servos, address, size)
-        return _whole(await self._link.ask(request, servos, size, deadline), size)
+            request = self._requests[key] = dxl.sync_read(servos, address, size, fast=fast)
+        return request
 
     async def _ask_one(self, record: ServoRecord, address: int, size: int, deadline: float) -> dict[int, Packet]:
         request = dxl.read(record.id, address, size)

@@ -10,7 +10,6 @@ from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
 from arm_companion.protocol.control_table import OperatingMode
 
-FIRST_FIRMWARE_WITH_WATCHDOG = 38
 _PING_SIZE = 3
 
 
@@ -51,13 +50,13 @@ async def identify(link: ServoLink, servo: int) -> tuple[int, int]:
     model, firmware = int.from_bytes(data[:2], "little"), data[2]
     if model != ct.MODEL_NUMBER_XL430_W250:
         raise DeviceFault(servo, 0, f"model number {model}, not {ct.MODEL_NUMBER_XL430_W250} (XL430-W250)")
-    if firmware < FIRST_FIRMWARE_WITH_WATCHDOG:
-        raise DeviceFault(servo, 0, f"firmware {firmware} is older than {FIRST_FIRMWARE_WITH_WATCHDOG}: no watchdog")
+    if firmware < ct.FIRST_FIRMWARE_WITH_WATCHDOG:
+        raise DeviceFault(servo, 0, f"firmware {firmware} is older than {ct.FIRST_FIRMWARE_WITH_WATCHDOG}: no watchdog")
     return model, firmware
 
 
 async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> ServoInfo:
-    """Prepare one servo for goals; its torque stays as it is, off or on.
+    """Prepare one servo for goals, all but its turns (`servo_homing`); its torque stays as it is, off or on.
 
     EEPROM is written only where it differs and only with the torque off. A tripped bus watchdog is cleared,
     and the servo told to stay where it is before anything can move it.
@@ -92,7 +91,7 @@ async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> Se
     await link.write(servo, ct.BUS_WATCHDOG, settings.watchdog)
     shutdown = await link.read(servo, ct.SHUTDOWN)
     record.tripped = False
-    record.set_up = True
+    record.firmware = firmware
     record.missed = 0
     return ServoInfo(servo, model, firmware, return_delay, shutdown, fresh)
 

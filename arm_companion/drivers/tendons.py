@@ -97,6 +97,7 @@ class Tendons:
             age_s=servo.age_s,
             torque=servo.torque,
             ready=servo.ready,
+            homed=not servo.turns_lost,
         )
 
     # Tendon to servo.

@@ -53,6 +53,7 @@ class TendonState:
     age_s: float  # since the last good reply
     torque: bool  # torque is on
     ready: bool = True  # it follows goals: set up, watchdog quiet, no fault, turns known
+    homed: bool = True  # its turns are known: `pull` says where the tendon is
 
 
 class Order(enum.Enum):
@@ -64,6 +65,7 @@ class Order(enum.Enum):
     RELEASE = "release"
     ABORT = "abort"
     JOG = "jog"
+    CLEAR_ERRORS = "clear_errors"
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,3 +241,4 @@ class Commands:
     notices: tuple[Notice, ...]
     status: StatusReport
     wrench: WrenchReport
+    recover: bool = False  # reboot and home the servos that need it: a person sees the arm hang straight

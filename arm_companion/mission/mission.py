@@ -26,6 +26,7 @@ from arm_companion.mission.wrench import predict
 
 _JOG_BEND = 1
 _JOG_VEHICLE = 3
+_CLEAR_TIMEOUT_S = 6.0
 
 SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
 """What the servos do in each phase when the cycle itself fails or the daemon is told to stop.
@@ -55,6 +56,8 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
     for request in facts.requests:
         situation = _obey(situation, request, answers, notices)
     situation = _move_on(situation, answers, notices)
+    recover = _begins_clearing(situation)
+    situation = _finish_clearing(situation, answers)
     state, arm, pulls = actions.act(situation)
     situation = situation.remembering(state)
     prediction = predict(situation)
@@ -73,6 +76,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         tuple(notices),
         status_report(situation, prediction),
         prediction.wrench,
+        recover,
     )
     return state, commands
 
@@ -123,7 +127,7 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         s = s.remembering(dataclasses.replace(s.state, running=None))
     if request.order is Order.READY:
         s = s.remembering(dataclasses.replace(s.state, streaming=True, errors=ArmFault.NONE))
-    if request.order is Order.PERCH:
+    if request.order in {Order.PERCH, Order.CLEAR_ERRORS}:
         s = s.remembering(dataclasses.replace(s.state, errors=ArmFault.NONE))
     if row.target is not phase:
         aborted = ArmFault.OPERATOR_ABORT if request.order is Order.ABORT else ArmFault.NONE
@@ -132,7 +136,28 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         answers.append(Answer(request.id, Result.ACCEPTED, progress=100))
         return s
     answers.append(Answer(request.id, Result.IN_PROGRESS, progress=0))
-    return s.remembering(dataclasses.replace(s.state, running=Running(request.id, request.order, row.done)))
+    return s.remembering(dataclasses.replace(s.state, running=Running(request.id, request.order, row.done, s.t)))
+
+
+def _begins_clearing(s: Situation) -> bool:
+    """Whether CLEAR_ERRORS came in this cycle and there is something to bring back."""
+    running = s.state.running
+    began = running is not None and running.order is Order.CLEAR_ERRORS and running.since == s.t
+    return began and s.servo_fault is not None
+
+
+def _finish_clearing(s: Situation, answers: list[Answer]) -> Situation:
+    """Answer CLEAR_ERRORS once the servos are well, or after as long as bringing them back may take."""
+    running = s.state.running
+    if running is None or running.order is not Order.CLEAR_ERRORS:
+        return s
+    if (fault := s.servo_fault) is None:
+        answers.append(Answer(running.request, Result.ACCEPTED, progress=100))
+    elif s.t - running.since > _CLEAR_TIMEOUT_S:
+        answers.append(Answer(running.request, Result.FAILED, fault))
+    else:
+        return s
+    return s.remembering(dataclasses.replace(s.state, running=None))
 
 
 def _jog(s: Situation, request: Request) -> State:

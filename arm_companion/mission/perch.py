@@ -62,7 +62,7 @@ def vehicle_lost(s: Situation) -> str | None:
 
 
 def servo_fault(s: Situation) -> str | None:
-    """A servo is silent or reports a hardware error."""
+    """A servo is silent, reports a hardware error, or no longer knows its turns."""
     return s.servo_fault
 
 
@@ -286,6 +286,9 @@ ORDERS: tuple[Ask, ...] = (
     Ask(Order.ABORT, FREE_FLIGHT, Phase.DEPART, frozenset({Phase.DEPART})),
     Ask(Order.ABORT, GRASPING | GRIPPED, Phase.UNLOAD, frozenset({Phase.UNLOAD})),
     Ask(Order.ABORT, frozenset({Phase.READYING, Phase.READY}), Phase.STOWING, frozenset({Phase.STOWING})),
+    # servos may be rebooted and homed only where nothing hangs on them; `done` is when they are well
+    Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset()),
+    Ask(Order.CLEAR_ERRORS, STOWED_ONLY, Phase.STOWED, frozenset()),
     *(
         # nothing is under way that could be given up, or it is being given up already
         Ask(Order.ABORT, frozenset({phase}), phase, frozenset({phase}))

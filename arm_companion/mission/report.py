@@ -63,7 +63,7 @@ def _present_faults(s: Situation) -> ArmFault:
         ArmFault.VEHICLE_STATE_STALE: not s.vehicle_fresh,
         ArmFault.AUTOPILOT_FAILSAFE: vehicle.control is Control.FAILSAFE,
         ArmFault.SERVO_SILENT: any(tendon.silent for tendon in tendons),
-        ArmFault.SERVO_FAULT: any(tendon.error_bits for tendon in tendons),
+        ArmFault.SERVO_FAULT: any(tendon.error_bits or not tendon.homed for tendon in tendons),
         ArmFault.TENDON_OVER_TENSION: any(t.tension > s.config.limits.tension_max_n for t in tendons),
     }
     return ArmFault(sum(fault.value for fault, present in there.items() if present))

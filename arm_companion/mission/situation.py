@@ -122,6 +122,8 @@ class Situation:
                 return f"tendon {i + 1}: servo hardware error 0x{tendon.error_bits:02x}"
             if tendon.silent:
                 return f"tendon {i + 1}: servo does not answer"
+            if not tendon.homed:
+                return f"tendon {i + 1}: servo lost its turns (arm straight? then CLEAR_ERRORS)"
             if tendon.torque and not tendon.ready:
                 return f"tendon {i + 1}: servo does not follow goals"
         return None

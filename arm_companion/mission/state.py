@@ -53,6 +53,7 @@ class Running:
     request: int
     order: Order
     done: frozenset[Phase]
+    since: float = 0.0  # loop time
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 MODEL_NUMBER_XL430_W250 = 1060
+FIRST_FIRMWARE_WITH_WATCHDOG = 38
+FIRST_FIRMWARE_WITH_FAST_SYNC_READ = 45
 
 TICKS_PER_TURN = 4096
 TICK_RAD = 2 * math.pi / TICKS_PER_TURN

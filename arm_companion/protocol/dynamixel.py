@@ -182,6 +182,11 @@ def fast_sync_answer(replies: Iterable[tuple[int, int, bytes]]) -> bytes:
     return out
 
 
+def fast_sync_size(servos: int, size: int) -> int:
+    """Bytes of the one frame in which so many servos answer a Fast Sync Read of `size` bytes."""
+    return _PREFIX + 1 + servos * (size + 4)
+
+
 def split_fast_sync_answer(packet: Packet, size: int) -> list[Packet]:
     """The answers of the single servos in the answer to a Fast Sync Read of `size` bytes.
 

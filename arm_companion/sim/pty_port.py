@@ -10,7 +10,7 @@ import contextlib
 import errno
 import fcntl
 import os
-import termios
+import struct
 import tty
 from pathlib import Path
 
@@ -18,7 +18,8 @@ from arm_companion.errors import LinkError
 from arm_companion.transport.base import Opener, Receiver
 
 _READ_SIZE = 4096
-_BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[:1] == "B" and name[1:].isdecimal()}
+_TCGETS2 = 0x802C542A
+_TERMIOS2 = struct.Struct("4I20x2I")  # flags, line discipline and characters, speeds as numbers
 
 
 class PtyTransport:
@@ -56,9 +57,10 @@ class PtyTransport:
         self._loop.add_reader(self._master, self._read)
 
     @property
-    def baud(self) -> int | None:
-        """Bits per second that the other side has set, None when it is not a standard speed."""
-        return _BAUDS.get(termios.tcgetattr(self._slave)[5])
+    def baud(self) -> int:
+        """Bits per second that the other side has set."""
+        settings = fcntl.ioctl(self._slave, _TCGETS2, bytes(_TERMIOS2.size))
+        return int(_TERMIOS2.unpack(settings)[-1])
 
     def write(self, data: bytes) -> None:
         """Send; what does not fit because nobody reads is dropped and counted."""

@@ -7,7 +7,7 @@ behind a pty or a memory pipe.
 import asyncio
 import random
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from arm_companion.config.schema import ServosConfig
@@ -108,6 +108,10 @@ def _unchanged(data: bytes) -> bytes:
     return data
 
 
+def _whole(data: bytes) -> list[tuple[float, bytes]]:
+    return [(0.0, data)]
+
+
 class EmulatedBus:
     """The wire between an emulator and one end of a byte pipe.
 
@@ -120,6 +124,8 @@ class EmulatedBus:
         to_servos: fault on what the master sends.
         to_master: fault on what the servos send.
         latency_s: added to every answer, as a USB adapter's latency timer does.
+        delays: fault on the times of what the servos send: the pieces in which an answer comes, each with the
+            pause before it.
     """
 
     def __init__(self, emulator: ServoEmulator, config: ServosConfig) -> None:
@@ -127,6 +133,7 @@ class EmulatedBus:
         self.to_servos: Fault = _unchanged
         self.to_master: Fault = _unchanged
         self.latency_s = 0.0
+        self.delays: Callable[[bytes], list[tuple[float, bytes]]] = _whole
         self._baud = config.baud
         self._transport: Transport | None = None
         self._ready = asyncio.Event()
@@ -176,13 +183,14 @@ class EmulatedBus:
 
     def _receive(self, data: bytes) -> None:
         now = asyncio.get_running_loop().time()
-        set_by_peer = self._transport.baud if isinstance(self._transport, PtyTransport) else None
-        baud = set_by_peer or self._baud
+        baud = self._transport.baud if isinstance(self._transport, PtyTransport) else self._baud
         byte_s = _BITS_PER_BYTE / baud
         end = max(now, self._line_free_at) + len(data) * byte_s
         for delay, answer in self.emulator.respond(self.to_servos(data), baud):
             end += delay + len(answer) * byte_s
-            self._queue.append((end + self.latency_s, answer))
+            for pause, piece in self.delays(answer):
+                end += pause
+                self._queue.append((end + self.latency_s, piece))
         self._line_free_at = end
         self._arm()
 

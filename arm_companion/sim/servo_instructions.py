@@ -49,7 +49,7 @@ def respond(packet: Packet, listening: Sequence[EmulatedServo], *, chained: bool
     for shadow in shadows:
         _execute(shadow, packet)
     if not broadcast:
-        return [reply for servo in addressed for reply in _answer(servo, packet)]
+        return _collided([reply for servo in addressed for reply in _answer(servo, packet)])
     by_id = {s.id: s for s in sorted(listening, key=lambda s: s.id)}
     match packet.instruction:
         case Instruction.PING:
@@ -73,6 +73,8 @@ def _sync_read(packet: Packet, listening: dict[int, EmulatedServo], chained: boo
     blocks: list[tuple[EmulatedServo, int, bytes]] = []
     for servo_id in wanted:
         servo = listening.get(servo_id)
+        if servo is not None and fast and servo.peek(ct.FIRMWARE_VERSION) < ct.FIRST_FIRMWARE_WITH_FAST_SYNC_READ:
+            servo = None
         if servo is None or servo.silenced or servo.peek(ct.STATUS_RETURN_LEVEL) == 0:
             if chained or fast:
                 break
@@ -89,6 +91,18 @@ def _sync_read(packet: Packet, listening: dict[int, EmulatedServo], chained: boo
     missing = len(wanted) - len(blocks)
     answer = dxl.fast_sync_answer(whole + [(0, 0, bytes(size))] * missing)
     return [_reply(blocks[0][0], answer[: len(answer) - missing * (size + 4)])]
+
+
+def _collided(replies: list[Reply]) -> list[Reply]:
+    """What is on the wire when several servos with one id answer at once: a low bit wins over a high one."""
+    if len(replies) < 2:
+        return replies
+    size = max(len(reply.data) for reply in replies)
+    wire = bytearray(b"\xff" * size)
+    for reply in replies:
+        for i, byte in enumerate(reply.data):
+            wire[i] &= byte
+    return [Reply(min(reply.delay_s for reply in replies), bytes(wire))]
 
 
 def _answer(servo: EmulatedServo, packet: Packet) -> list[Reply]:

@@ -1,11 +1,18 @@
-"""A serial device, or a pseudo-terminal, as a transport."""
+"""A serial device, or a pseudo-terminal, as a transport.
+
+pyserial opens and configures the device; bytes then pass between its descriptor and the event loop without a
+layer between, because a servo bus wakes the process a few hundred times a second.
+"""
 
 import asyncio
 import contextlib
+import errno
 import logging
+import os
+from collections import deque
+from pathlib import Path
 
 import serial
-from serial_asyncio_fast import SerialTransport, create_serial_connection
 
 from arm_companion.errors import LinkError
 from arm_companion.transport.base import Opener, Receiver
@@ -15,57 +22,99 @@ _log = logging.getLogger(__name__)
 BACKLOG_BYTES = 4096
 """What may wait to be sent before the oldest of it is dropped: 40 ms at 1 Mbit/s."""
 
+LONGEST_LATENCY_TIMER_MS = 4
+"""An adapter whose latency timer is longer spoils a servo bus; FTDI ships 16 ms."""
 
-class SerialPort(asyncio.Protocol):
-    """An open serial device."""
+_READ_SIZE = 4096
 
-    def __init__(self, receiver: Receiver) -> None:
+
+class SerialPort:
+    """An open serial device.
+
+    Args:
+        device: open and non-blocking; closed with the port.
+        receiver: takes what arrives.
+    """
+
+    def __init__(self, device: serial.Serial, receiver: Receiver) -> None:
         self.dropped = 0
+        self._device = device
+        self._descriptor: int = device.fileno()
         self._receiver = receiver
-        self._waiting = 0  # chunks, since the backlog was last empty
-        self._transport: SerialTransport | None = None
+        self._waiting: deque[bytes] = deque()
+        self._waiting_bytes = 0
         self._gone = asyncio.Event()
+        self._loop = asyncio.get_running_loop()
+        self._loop.add_reader(self._descriptor, self._read)
 
     def write(self, data: bytes) -> None:
-        """Send `data`; a backlog that has grown too long is dropped first."""
-        transport = self._transport
-        if transport is None or transport.is_closing():
+        """Send `data`; of what has to wait, the oldest is dropped when it is too much."""
+        if self._gone.is_set() or not data:
             return
-        backlog = transport.get_write_buffer_size()
-        if not backlog:
-            self._waiting = 0
-        elif backlog + len(data) > BACKLOG_BYTES:
-            transport.flush()
-            self.dropped += self._waiting
-            self._waiting = 0
-        transport.write(data)
-        self._waiting += 1
+        if not self._waiting:
+            data = data[self._send(data) :]
+            if not data or self._gone.is_set():
+                return
+            self._loop.add_writer(self._descriptor, self._write_waiting)
+        self._waiting.append(data)
+        self._waiting_bytes += len(data)
+        while self._waiting_bytes > BACKLOG_BYTES and len(self._waiting) > 1:
+            self._waiting_bytes -= len(self._waiting.popleft())
+            self.dropped += 1
 
     def close(self) -> None:
         """Release the device; what is still to be sent is lost."""
-        if self._transport is not None and not self._transport.is_closing():
-            self._transport.abort()
+        if self._gone.is_set():
+            return
+        self._gone.set()
+        self._loop.remove_reader(self._descriptor)
+        self._loop.remove_writer(self._descriptor)
+        self._waiting.clear()
+        with contextlib.suppress(OSError, serial.SerialException):
+            self._device.close()
 
     async def wait_closed(self) -> None:
         """Return when the device is released or lost."""
         await self._gone.wait()
 
-    # What the event loop calls.
+    def _read(self) -> None:
+        try:
+            data = os.read(self._descriptor, _READ_SIZE)
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError as error:
+            self._lose(error)
+            return
+        if data:
+            self._receiver(data)
+        else:
+            self._lose("hung up")
 
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Take over the open device."""
-        self._transport = transport
+    def _send(self, data: bytes) -> int:
+        """How many bytes the kernel took."""
+        try:
+            return os.write(self._descriptor, data)
+        except (BlockingIOError, InterruptedError):
+            return 0
+        except OSError as error:
+            self._lose(error)
+            return 0
 
-    def data_received(self, data: bytes) -> None:
-        """Pass on what arrived."""
-        self._receiver(data)
+    def _write_waiting(self) -> None:
+        while self._waiting:
+            sent = self._send(self._waiting[0])
+            self._waiting_bytes -= sent
+            if self._gone.is_set():
+                return
+            if sent < len(self._waiting[0]):
+                self._waiting[0] = self._waiting[0][sent:]
+                return
+            self._waiting.popleft()
+        self._loop.remove_writer(self._descriptor)
 
-    def connection_lost(self, exc: Exception | None) -> None:
-        """Tell whoever waits that the device is gone."""
-        if exc is not None:
-            _log.warning("serial device lost: %s", exc)
-        self._transport = None
-        self._gone.set()
+    def _lose(self, why: object) -> None:
+        _log.warning("serial device %s lost: %s", self._device.port, why)
+        self.close()
 
 
 def open_serial(port: str, baud: int) -> Opener:
@@ -83,18 +132,42 @@ def open_serial(port: str, baud: int) -> Opener:
     """
 
     async def open_port(receiver: Receiver) -> SerialPort:
-        opened = SerialPort(receiver)
         try:
-            transport, _ = await create_serial_connection(
-                asyncio.get_running_loop(), lambda: opened, port, baudrate=baud, exclusive=True
-            )
+            device = serial.Serial(port, baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
         except (OSError, ValueError) as error:  # serial.SerialException is an OSError
-            raise LinkError(f"cannot open {port} at {baud} bit/s: {error}") from error
-        opened.connection_made(transport)  # the loop would do so one turn later
-        _prefer_latency(transport.serial)
-        return opened
+            reason: object = error
+            if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
+                reason = "another program holds its lock (the daemon, or another command on the servo bus)"
+            raise LinkError(f"cannot open {port} at {baud} bit/s: {reason}") from error
+        _prefer_latency(device)
+        return SerialPort(device, receiver)
 
     return open_port
+
+
+def latency_timer_ms(port: str, sysfs: Path = Path("/sys")) -> int | None:
+    """How long a USB adapter collects bytes before it passes them on, ms; None where there is no such timer.
+
+    Args:
+        port: device, or a link to it such as those in /dev/serial/by-id.
+        sysfs: where the kernel shows its devices.
+    """
+    name = Path(os.path.realpath(port)).name
+    try:
+        return int((sysfs / "bus/usb-serial/devices" / name / "latency_timer").read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
+
+def latency_advice(port: str, sysfs: Path = Path("/sys")) -> str:
+    """What is wrong with an adapter's latency timer and what to do, or nothing."""
+    timer = latency_timer_ms(port, sysfs)
+    if timer is None or timer <= LONGEST_LATENCY_TIMER_MS:
+        return ""
+    return (
+        f"{port}: the USB adapter's latency timer is {timer} ms, so every answer of a servo comes that late; "
+        "install systemd/99-arm-companion.rules as a udev rule, which sets 1 ms"
+    )
 
 
 def _prefer_latency(device: serial.Serial) -> None:
@@ -102,3 +175,5 @@ def _prefer_latency(device: serial.Serial) -> None:
         device.set_low_latency_mode(True)
     with contextlib.suppress(OSError, serial.SerialException):
         device.reset_input_buffer()
+    if advice := latency_advice(str(device.port)):
+        _log.warning("%s", advice)

@@ -13,6 +13,7 @@ from pathlib import Path
 from tests.bench.measure import Result
 from tests.bench.mechanics import mechanics
 from tests.bench.protocols import protocols
+from tests.bench.servo_cycle import servo_cycle
 
 
 def main() -> None:
@@ -22,7 +23,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results: list[Result] = []
     _say(f"{'':<44}{'ours':>11} {'unit':<6}{'peer':>11}  {'ratio':>8}  beside")
-    for part in (mechanics, protocols):
+    for part in (mechanics, protocols, servo_cycle):
         for result in part(arguments.rounds):
             results.append(result)
             _say(result.line())

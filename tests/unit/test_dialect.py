@@ -19,7 +19,7 @@ from arm_companion.mission.facts import WrenchSource
 from arm_companion.mission.state import Phase
 from arm_companion.protocol.dialect import XML, mav
 
-OURS = range(64000, 64007)
+OURS = range(64000, 64008)
 TREE = ET.parse(XML)
 REPOSITORY = Path(__file__).parents[2]
 
@@ -71,6 +71,7 @@ def test_our_messages_stand_in_their_block_and_fit_into_a_tunnel() -> None:
         "ARM_TARGET",
         "ARM_SETPOINT",
         "ARM_PAYLOAD",
+        "ARM_SERVOS",
     ]
     for id_ in OURS:
         assert mav.mavlink_map[id_].unpacker.size <= 116, mav.mavlink_map[id_].msgname

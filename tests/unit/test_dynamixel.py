@@ -31,6 +31,7 @@ GOLDEN = [
     (dxl.reboot(1), "FF FF FD 00 01 03 00 08 2F 4E"),
     (dxl.clear_turns(1), "FF FF FD 00 01 08 00 10 01 44 58 4C 22 B1 DC"),
     (dxl.sync_read((1, 2), 132, 4), "FF FF FD 00 FE 09 00 82 84 00 04 00 01 02 CE FA"),
+    (dxl.sync_read((3, 7, 4), 132, 4, fast=True), "FF FF FD 00 FE 0A 00 8A 84 00 04 00 03 07 04 20 F2"),
     (
         dxl.sync_write(116, {1: (150).to_bytes(4, "little"), 2: (170).to_bytes(4, "little")}),
         "FF FF FD 00 FE 11 00 83 74 00 04 00 01 96 00 00 00 02 AA 00 00 00 82 87",
@@ -194,12 +195,15 @@ def test_fast_sync_read_answers_hold_any_data(sized: tuple[int, list[tuple[int, 
     ]
 
 
-def test_fast_sync_answer_carries_a_crc_after_each_servo() -> None:
-    raw = dxl.fast_sync_answer([(3, 0, b"\x01\x02\x03\x04"), (7, 0, b"\x05\x06\x07\x08"), (4, 0, b"\x09" * 4)])
-    assert raw[5] == 25  # 3 servos, 4 bytes each: the maker's own example
+def test_a_fast_sync_answer_is_the_makers() -> None:
+    values = {3: 166, 7: 2079, 4: 1023}
+    made = dxl.fast_sync_answer([(servo, 0, value.to_bytes(4, "little")) for servo, value in values.items()])
+    assert made == frame_hex(
+        "FF FF FD 00 FE 19 00 55 00 03 A6 00 00 00 84 08 00 07 1F 08 00 00 16 CA 00 04 FF 03 00 00 D1 9E"
+    )
+    assert len(made) == dxl.fast_sync_size(3, 4)
     for end in (16, 24, 32):
-        assert int.from_bytes(raw[end - 2 : end], "little") == bitwise_crc(raw[: end - 2])
-    assert len(raw) == 32
+        assert int.from_bytes(made[end - 2 : end], "little") == bitwise_crc(made[: end - 2])
 
 
 def test_a_fast_sync_answer_of_another_size_is_refused() -> None:

@@ -19,7 +19,7 @@ TYPES = {
     "uint8_t": "B", "int8_t": "b", "uint16_t": "H", "int16_t": "h", "uint32_t": "I", "int32_t": "i",
     "uint64_t": "Q", "int64_t": "q",
 }  # fmt: skip
-USED = sorted({0, 4, 31, 32, 75, 76, 77, 84, 245, 253, 385, *range(64000, 64007)})
+USED = sorted({0, 4, 31, 32, 75, 76, 77, 84, 245, 253, 385, *range(64000, 64008)})
 
 
 def scalars(type_: str) -> st.SearchStrategy[float]:

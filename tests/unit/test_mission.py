@@ -291,3 +291,47 @@ def test_a_wrench_over_its_limit_unloads_the_grip(parameters: Parameters, hoveri
     state, said = run(at(Phase.PERCHED, anchor=ANCHOR, prediction=prediction), hovering(), parameters)
     assert state.phase is Phase.UNLOAD
     assert any("13.0 N" in notice.text for c in said for notice in c.notices)
+
+
+# CLEAR_ERRORS.
+
+
+def lost_turns(facts: Facts) -> Facts:
+    return dataclasses.replace(
+        facts, tendons=tuple(dataclasses.replace(t, homed=False, ready=False, torque=False) for t in facts.tendons)
+    )
+
+
+def test_clear_errors_has_the_servos_brought_back_once_and_tells_how_it_ended(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    broken, well = lost_turns(hovering()), hovering()
+    state = at(Phase.STOWED, errors=ArmFault.TIMEOUT)
+    state, said = run(state, ask(broken, Order.CLEAR_ERRORS), parameters, 1.0)
+    assert [commands.recover for commands in said] == [True] + [False] * 99
+    assert [a.result for a in answers(said)] == [Result.IN_PROGRESS]
+    assert state.errors == ArmFault.NONE
+    after, said = run(state, well, parameters)
+    assert [a.result for a in answers(said)] == [Result.ACCEPTED]
+    assert after.running is None
+    state, said = run(state, broken, parameters, 7.0)
+    (answer,) = answers(said)
+    assert (answer.result, state.running, state.phase) == (Result.FAILED, None, Phase.STOWED)
+    assert "lost its turns" in answer.reason
+
+
+@pytest.mark.parametrize("phase", [p for p in Phase if p not in {Phase.STARTUP, Phase.STOWED}])
+def test_no_servo_is_rebooted_or_homed_where_something_hangs_on_it(
+    parameters: Parameters, hovering: Hovering, phase: Phase
+) -> None:
+    _, said = run(at(phase, anchor=ANCHOR), ask(hovering(), Order.CLEAR_ERRORS), parameters)
+    assert [a.result for a in answers(said)] == [Result.TEMPORARILY_REJECTED]
+    assert not any(commands.recover for commands in said)
+
+
+def test_a_servo_that_lost_its_turns_is_a_fault_even_without_torque(parameters: Parameters, hovering: Hovering) -> None:
+    _, said = run(at(Phase.STOWED), ask(lost_turns(hovering()), Order.READY), parameters)
+    (answer,) = answers(said)
+    assert answer.result is Result.TEMPORARILY_REJECTED
+    assert "lost its turns" in answer.reason
+    assert said[-1].status.error_bits & ArmFault.SERVO_FAULT

@@ -209,14 +209,21 @@ def test_start_without_a_port_is_a_link_error() -> None:
 # The cycle.
 
 
-def test_a_cycle_is_one_sync_read_and_one_sync_write() -> None:
+@pytest.mark.parametrize(
+    ("firmware", "instruction"),
+    [(44, dxl.Instruction.SYNC_READ), (45, dxl.Instruction.FAST_SYNC_READ)],
+)
+def test_a_cycle_is_one_sync_read_and_one_sync_write(firmware: int, instruction: dxl.Instruction) -> None:
+    def prepare(rig: Rig) -> None:
+        rig.emulator[3].poke(ct.FIRMWARE_VERSION, firmware)  # the oldest firmware decides
+
     async def story(rig: Rig) -> None:
         await rig.bus.start()
         await rig.cycles(6)
         rig.sent.clear()
         states = await rig.cycles(1, (2048, 2050, 2052, 2054))
         assert [(p.id, p.instruction) for p in rig.sent] == [
-            (dxl.BROADCAST_ID, dxl.Instruction.SYNC_READ),
+            (dxl.BROADCAST_ID, instruction),
             (dxl.BROADCAST_ID, dxl.Instruction.SYNC_WRITE),
         ]
         assert rig.sent[0].parameters == bytes((124, 0, 23, 0, 1, 2, 3, 4))
@@ -224,7 +231,7 @@ def test_a_cycle_is_one_sync_read_and_one_sync_write() -> None:
         assert all(s.age_s < 0.001 and not s.silent and s.ready for s in states)
         assert all(s.voltage == pytest.approx(12.0) and s.temperature == 30.0 for s in states)
 
-    scenario(story)
+    scenario(story, prepare=prepare)
 
 
 def test_a_cycle_takes_little_more_than_its_time_on_the_wire() -> None:
@@ -353,7 +360,7 @@ def test_a_reboot_ends_a_shutdown_and_the_turns_are_not_assumed() -> None:
         assert not states[2].ready
         assert not states[2].torque
         assert rig.emulator.positions()[2] == pytest.approx(2048, abs=10)
-        rig.bus.accept_position(3)
+        await rig.bus.accept_position(3)
         states = await rig.cycles(100, (2100,) * 4, torque=True)
         assert states[2].position == pytest.approx(2100, abs=10)
         running.cancel()

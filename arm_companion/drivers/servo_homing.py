@@ -1,0 +1,89 @@
+"""Turns: which of its many turns a servo's horn is in, who knows it, and how it is found again.
+
+An XL430 knows its horn's angle within one turn always, and counts turns only while it has power. Its LED says
+whether the count can be believed: the driver lights it when it does, and no power-up ever does.
+"""
+
+from arm_companion.drivers.servo_health import ServoRecord
+from arm_companion.drivers.servo_link import ServoLink
+from arm_companion.drivers.servo_setup import stay
+from arm_companion.errors import DeviceFault
+from arm_companion.protocol import control_table as ct
+
+_TURN = ct.TICKS_PER_TURN
+
+
+def nearest_turn(position: int, near: int) -> int:
+    """The position at the same angle of the horn, whole turns aside, that is nearest to `near`; ticks."""
+    return position + _TURN * round((near - position) / _TURN)
+
+
+async def adopt(link: ServoLink, record: ServoRecord, zero: int, window: int) -> None:
+    """Decide at the first meeting whether a servo's count of turns can be believed, and mark those that can.
+
+    It can where someone vouched for it before (LED), and where the torque is on, which no servo has after a loss
+    of power. Otherwise the arm is taken to hang straight, each tendon near its zero: a servo within `window` of
+    it (ticks, whole turns aside) is homed there, and another has lost its turns.
+
+    Raises:
+        DeviceFault: it is silent, or refuses.
+    """
+    if await link.read(record.id, ct.LED):
+        record.turns_lost = False
+        return
+    if record.torque:
+        await _believe(link, record)
+        return
+    position = await link.read(record.id, ct.PRESENT_POSITION)
+    if abs(nearest_turn(position, zero) - zero) <= window:
+        await home(link, record, zero)
+    else:
+        record.turns_lost = True
+
+
+async def home(link: ServoLink, record: ServoRecord, near: int) -> None:
+    """Believe a servo again, whose horn is known to be within half a turn of `near`.
+
+    Whole turns go into its homing offset, so that it reports the right position also to the next program. Its
+    goal becomes where it is; the torque stays off.
+
+    Args:
+        link: the bus.
+        record: of the servo.
+        near: ticks.
+
+    Raises:
+        DeviceFault: it is silent, refuses, or its torque is on.
+    """
+    servo = record.id
+    if await link.read(servo, ct.TORQUE_ENABLE):
+        raise DeviceFault(servo, 0, "cannot be homed: its torque is on")
+    position = await link.read(servo, ct.PRESENT_POSITION)
+    wanted = nearest_turn(position, near)
+    if wanted != position:
+        offset = await link.read(servo, ct.HOMING_OFFSET) + wanted - position
+        if not ct.HOMING_OFFSET.lower <= offset <= ct.HOMING_OFFSET.upper:
+            raise DeviceFault(servo, 0, f"cannot be homed: a homing offset of {offset} is out of its range")
+        await link.write(servo, ct.HOMING_OFFSET, offset)
+        position = await link.read(servo, ct.PRESENT_POSITION)
+        if abs(position - near) > _TURN // 2 + _TURN // 16:  # it may have been turned a little meanwhile
+            raise DeviceFault(servo, 0, f"cannot be homed: it reports {position} where {near} was expected")
+    await stay(link, record)
+    record.rebase(position)
+    await _believe(link, record)
+
+
+async def doubt(link: ServoLink, record: ServoRecord) -> None:
+    """Put the light of a servo out whose turns are lost, so that the next program does not believe it either.
+
+    Raises:
+        DeviceFault: it is silent, or refuses.
+    """
+    await link.write(record.id, ct.LED, 0)
+    record.vouched = False
+
+
+async def _believe(link: ServoLink, record: ServoRecord) -> None:
+    await link.write(record.id, ct.LED, 1)
+    record.turns_lost = False
+    record.vouched = True
