@@ -203,7 +203,7 @@ class Daemon:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
-        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls)
+        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls, commands.tensions)
 
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""
