@@ -13,6 +13,7 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import Clock, Tick, ticks
 from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
+from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
@@ -85,8 +86,16 @@ class Daemon:
         self._autopilot = Autopilot(autopilot_link, config.vehicle)
         self._component = Component(self._links, config.vehicle, clock)
         self._telemetry = Telemetry(self._links, config.rates, clock)
-        self._bus = ServoBus(openers.servos, config.servos)
-        self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
+        self._calibrated = Calibrated(config, clock.unix(clock.now()))
+        self._bus = ServoBus(
+            openers.servos,
+            self._calibrated.servos,
+            parked=self._calibrated.parked,
+            parked_window=config.calibration.turned_ticks,
+        )
+        self._tendons = Tendons(
+            self._calibrated.servos, config.limits, config.arm.pulley_radius_m, self._calibrated.curves
+        )
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
@@ -123,12 +132,16 @@ class Daemon:
             except* DeviceFault as faults:
                 log.error("stopping: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
             finally:
+                self._calibrated.close()
                 for link in self._links:
                     link.close()
                 self._recorder.close()
 
     async def _cycles(self) -> None:
         self._manager.ready()
+        for warning in self._calibrated.warnings:
+            log.warning("%s", warning)
+            self._component.notify(Notice(Severity.WARNING, warning))
         async for tick in ticks(1.0 / self._config.rates.cycle_hz):
             self.missed += tick.missed
             try:
@@ -161,7 +174,8 @@ class Daemon:
         self._ready = ready
         requests, bar = self._component.take()
         self._bar = bar or self._bar
-        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
+        calibration = self._calibrated.judge(self._bus.info, servos)
+        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar, calibration)
 
     async def _rearm(self) -> None:
         """Servos stopped where they were because the bus was silent; goals go on from there."""
