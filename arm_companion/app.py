@@ -14,6 +14,7 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import Clock, Tick, ticks
 from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
+from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
@@ -95,8 +96,16 @@ class Daemon:
         self._component = Component(self._links, config.vehicle, clock)
         self._telemetry = Telemetry(self._links, config.rates, clock)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
-        self._bus = ServoBus(openers.servos, config.servos)
-        self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
+        self._calibrated = Calibrated(config, clock.unix(clock.now()))
+        self._bus = ServoBus(
+            openers.servos,
+            self._calibrated.servos,
+            parked=self._calibrated.parked,
+            parked_window=config.calibration.turned_ticks,
+        )
+        self._tendons = Tendons(
+            self._calibrated.servos, config.limits, config.arm.pulley_radius_m, self._calibrated.curves
+        )
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
@@ -133,6 +142,7 @@ class Daemon:
             except* DeviceFault as faults:
                 log.error("stopping: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
             finally:
+                self._calibrated.close()
                 for link in self._links:
                     link.close()
                 self._recorder.close()
@@ -162,6 +172,9 @@ class Daemon:
         if self._compiled_model:
             await self._prepare_model()
         self._manager.ready()
+        for warning in self._calibrated.warnings:
+            log.warning("%s", warning)
+            self._component.notify(Notice(Severity.WARNING, warning))
         async for tick in ticks(1.0 / self._config.rates.cycle_hz):
             self.missed += tick.missed
             try:
@@ -195,7 +208,8 @@ class Daemon:
         self._servo_telemetry.publish(now, servos, self._bus.counters)
         requests, bar = self._component.take()
         self._bar = bar or self._bar
-        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
+        calibration = self._calibrated.judge(self._bus.info, servos)
+        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar, calibration)
 
     async def _rearm(self) -> None:
         """Servos stopped where they were because the bus was silent; goals go on from there."""
@@ -237,7 +251,7 @@ class Daemon:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
-        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls)
+        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls, commands.tensions)
 
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""

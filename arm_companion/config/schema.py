@@ -9,8 +9,12 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from arm_companion.config.options import option, section
 from arm_companion.errors import ConfigError
+
+_WORST_COUPLING = 1e4  # condition number
 
 
 @dataclass(frozen=True)
@@ -194,7 +198,27 @@ class ServosConfig:
     voltage_min_v: float = option("a servo reports a supply below", 9.5, unit="V", lower=6.0, upper=14.0)
     voltage_max_v: float = option("a servo reports a supply above", 14.0, unit="V", lower=6.0, upper=14.0)
     pwm_limit: float = option("most of the full duty that a servo puts out", 1.0, lower=0.1, upper=1.0)
+    zero_sigma_m: float = option(
+        "one sigma of zero_ticks, as length of tendon; a calibration brings its own",
+        0.0005,
+        unit="m",
+        lower=0.0,
+        upper=0.1,
+    )
+    coupling: tuple[tuple[float, ...], ...] = option(
+        "row i: tendon i taken in for what each servo winds up; empty: each servo moves its own tendon alone",
+        (),
+        lower=-10.0,
+        upper=10.0,
+    )
     load_torque_nm: float = option("torque at 100 % load", 1.4, unit="N m", lower=0.05, upper=50.0)
+    load_voltage_v: float = option("supply at which load_torque_nm holds", 12.0, unit="V", lower=5.0, upper=15.0)
+    load_torque_sigma: float = option(
+        "one sigma of load_torque_nm, share of it, until `calibrate tension` has measured it",
+        0.1,
+        lower=0.0,
+        upper=1.0,
+    )
     load_sigma: float = option("one sigma of the load reading, share of full load", 0.02, lower=0.0, upper=1.0)
     friction_torque_nm: float = option("torque lost in the gear train", 0.05, unit="N m", lower=0.0, upper=5.0)
 
@@ -209,6 +233,30 @@ class ServosConfig:
             raise ConfigError("directions must be +1 or -1")
         if self.voltage_min_v >= self.voltage_max_v:
             raise ConfigError(f"voltage_min_v = {self.voltage_min_v:g} is not below {self.voltage_max_v:g}")
+        if self.coupling:
+            if len(self.coupling) != n or any(len(row) != n for row in self.coupling):
+                raise ConfigError(f"coupling must have {n} rows of {n} numbers for {n} ids")
+            if np.linalg.cond(np.array(self.coupling)) > _WORST_COUPLING:
+                raise ConfigError("coupling cannot be inverted: some tendons can only move together")
+
+
+@dataclass(frozen=True)
+class CalibrationConfig:
+    """[calibration] Where calibrations of the tendons are kept, and what the daemon makes of them."""
+
+    directory: str = option("state directory; empty: no calibration is looked for", "")
+    tendons: str = option(
+        "whether the arm flies without a calibration of its tendons; one that does not fit is refused in any case",
+        "optional",
+        choices=("optional", "required"),
+    )
+    turned_ticks: int = option(
+        "a servo that was without power counts as turned when it comes back farther than this from where it was",
+        128,
+        lower=1,
+        upper=2048,
+    )
+    max_age_days: float = option("an older calibration is used with a warning", 90.0, unit="d", lower=0.1, upper=3650.0)
 
 
 @dataclass(frozen=True)
@@ -217,6 +265,10 @@ class LimitsConfig:
 
     tension_min_n: float = option("least tension of every tendon", 0.5, unit="N", lower=0.0, upper=50.0)
     tension_max_n: float = option("greatest tension of any tendon", 45.0, unit="N", lower=1.0, upper=500.0)
+    tension_disagreement_sigma: float = option(
+        "a tendon whose load and statics differ by so many sigma counts as broken or jumped", 4.0, lower=1.0, upper=50.0
+    )
+    tension_disagreement_s: float = option("for how long they must differ", 0.5, unit="s", lower=0.05, upper=30.0)
     pull_max_m: float = option("tendon taken in or let out, from straight", 0.12, unit="m", lower=0.001, upper=2.0)
     pull_speed_m_per_s: float = option("tendon speed", 0.05, unit="m/s", lower=0.001, upper=1.0)
     bend_max_rad: float = option("commanded bend of the free arm", 5.1, unit="rad", lower=0.1, upper=4 * math.pi)
@@ -351,6 +403,7 @@ class Config:
     vehicle: VehicleConfig = section(VehicleConfig)
     links: Mapping[str, LinkConfig] = field(default_factory=dict)
     servos: ServosConfig = section(ServosConfig)
+    calibration: CalibrationConfig = section(CalibrationConfig)
     limits: LimitsConfig = section(LimitsConfig)
     perch: PerchConfig = section(PerchConfig)
     rates: RatesConfig = section(RatesConfig)

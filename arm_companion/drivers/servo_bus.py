@@ -8,7 +8,7 @@ one servo's failure never keeps goals from the others. `run` keeps the port open
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Iterable, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState
@@ -52,6 +52,8 @@ class ServoBus:
         *,
         speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S,
         rng: random.Random | None = None,
+        parked: Mapping[int, int] | None = None,
+        parked_window: int = 0,
     ) -> None:
         """Nothing is opened before `start` or `run`.
 
@@ -60,6 +62,9 @@ class ServoBus:
             config: which servos, how fast, which deadlines.
             speed_limit_rad_per_s: set in every servo as the speed of its own trajectory.
             rng: spreads reconnections in time.
+            parked: where servos last stood, ticks by id: one that lost its power is expected there, and elsewhere
+                at its zero.
+            parked_window: ticks within which it must stand there.
         """
         self._opener = opener
         self._config = config
@@ -67,6 +72,7 @@ class ServoBus:
         self._link = ServoLink(config.baud, config.reply_timeout_s)
         self._records = tuple(ServoRecord(servo, config.silent_after) for servo in config.ids)
         self._by_id = {record.id: record for record in self._records}
+        self._parked, self._parked_window = dict(parked or {}), parked_window
         self._zeros = dict(zip(config.ids, config.zero_ticks, strict=True))
         self._settings = settings_of(config, speed_limit_rad_per_s)
         self._reader = ServoReader(self._link, self._records, config, self._settings)
@@ -173,7 +179,10 @@ class ServoBus:
         async with self._setting_up:
             info = await set_up(self._link, record, self._settings)
             if record.id not in self.info:
-                await adopt(self._link, record, self._zeros[record.id], self._config.home_window_ticks)
+                near, window = self._zeros[record.id], self._config.home_window_ticks
+                if record.id in self._parked:
+                    near, window = self._parked[record.id], self._parked_window
+                await adopt(self._link, record, near, window)
             self.info[record.id] = info
             record.set_up = True
 

@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 from arm_companion.clock import Clock
 from arm_companion.config.schema import RatesConfig
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
-from arm_companion.mission.facts import StatusReport, TendonState, WrenchReport, WrenchSource
+from arm_companion.mission.facts import StatusReport, TendonState, TensionEstimate, WrenchReport, WrenchSource
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 
@@ -66,6 +66,7 @@ class Telemetry:
         tendons: Sequence[TendonState],
         wrench: WrenchReport,
         goals: Sequence[float] | None = None,
+        tensions: Sequence[TensionEstimate] = (),
     ) -> None:
         """Send whichever messages are due; called once a cycle.
 
@@ -75,10 +76,11 @@ class Telemetry:
             tendons: state of each tendon.
             wrench: predicted reaction wrench.
             goals: commanded displacement of each tendon, m; None when there is none.
+            tensions: estimates that replace those which the loads alone give; none when empty.
         """
         stamp = round(self._clock.unix(now) * 1e6)
         self._offer(STATUS, now, lambda: iter((status_message(stamp, status, tendons, wrench),)))
-        self._offer(TENDONS, now, lambda: tendon_messages(stamp, tendons, goals))
+        self._offer(TENDONS, now, lambda: tendon_messages(stamp, tendons, goals, tensions))
         self._offer(WRENCH, now, lambda: iter((wrench_message(stamp, wrench),)))
 
     def _offer(self, id_: int, now: float, make: Callable[[], Iterator[Message]]) -> None:
@@ -121,7 +123,7 @@ def status_message(stamp: int, status: StatusReport, tendons: Sequence[TendonSta
         _BEHAVIOURS.get(status.behaviour.upper(), mav.ARM_BEHAVIOUR_UNKNOWN),
         status.state_number,
         status.progress,
-        mav.ARM_CALIBRATION_UNKNOWN,
+        int(status.calibration),
         status.state.encode("ascii", errors="replace")[:20],
     )
 
@@ -146,14 +148,21 @@ def wrench_message(stamp: int, wrench: WrenchReport) -> Message:
     )
 
 
-def tendon_messages(stamp: int, tendons: Sequence[TendonState], goals: Sequence[float] | None) -> Iterator[Message]:
+def tendon_messages(
+    stamp: int,
+    tendons: Sequence[TendonState],
+    goals: Sequence[float] | None,
+    tensions: Sequence[TensionEstimate] = (),
+) -> Iterator[Message]:
     """ARM_TENDONS, one for each four tendons.
 
     Args:
         stamp: Unix time, us.
         tendons: state of each.
         goals: commanded displacement of each, m.
+        tensions: estimates that replace those which the loads alone give; none when empty.
     """
+    estimates = tensions or [TensionEstimate(t.tension, t.tension_sigma) for t in tendons]
     for first in range(0, len(tendons), PER_MESSAGE):
         group = tendons[first : first + PER_MESSAGE]
         wanted = (math.nan,) * len(group) if goals is None else goals[first : first + PER_MESSAGE]
@@ -161,8 +170,8 @@ def tendon_messages(stamp: int, tendons: Sequence[TendonState], goals: Sequence[
             stamp,
             _padded([t.pull for t in group], math.nan),
             _padded(wanted, math.nan),
-            _padded([t.tension for t in group], math.nan),
-            _padded([t.tension_sigma for t in group], math.nan),
+            _padded([e.tension for e in estimates[first : first + PER_MESSAGE]], math.nan),
+            _padded([e.sigma for e in estimates[first : first + PER_MESSAGE]], math.nan),
             _padded([_scaled(t.load, 1e3, -_INT16_MAX, _INT16_MAX) for t in group], _INT16_MAX),
             _padded([_scaled(t.temperature, 1e2, -_INT16_MAX, _INT16_MAX) for t in group], _INT16_MAX),
             _padded([_scaled(t.voltage, 1e3, 0, _UINT16_MAX) for t in group], _UINT16_MAX),

@@ -53,7 +53,27 @@ class TendonState:
     age_s: float  # since the last good reply
     torque: bool  # torque is on
     ready: bool = True  # it follows goals: set up, watchdog quiet, no fault, turns known
+    tension_bias: float = 0.0  # N, the part of the sigma that averaging does not take away
     homed: bool = True  # its turns are known: `pull` says where the tendon is
+
+
+class CalibrationState(enum.IntEnum):
+    """What is known of the tendons' zeros, ARM_CALIBRATION of the dialect."""
+
+    UNKNOWN = 0  # the servos have not been heard yet
+    MISSING = 1  # the zeros are the configuration's
+    STALE = 2  # there is one, and it does not fit this arm any more
+    RUNNING = 3
+    VALID = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """The tendons' calibration as far as the mission cares."""
+
+    state: CalibrationState = CalibrationState.UNKNOWN
+    refusal: str = ""  # why the arm must not fly on it; empty: it may
+    zero_sigma: float = 0.0005  # m of tendon
 
 
 class Order(enum.Enum):
@@ -149,6 +169,7 @@ class ArmFlag(enum.IntFlag):
     NONE = 0
     SERVOS_CONNECTED = 1
     TORQUE_ON = 2
+    CALIBRATED = 4
     VEHICLE_CONNECTED = 8
     VEHICLE_STATE_FRESH = 16
     EXTERNAL_CONTROL = 32
@@ -171,12 +192,16 @@ class ArmFault(enum.IntFlag):
     OPERATOR_ABORT = 256
     SERVO_SILENT = 512
     SERVO_FAULT = 1024
+    TENDON_SLACK = 16384
     TENDON_OVER_TENSION = 32768
+    TENDON_BROKEN = 65536
+    TENSION_DISAGREES = 131072
     NO_CONTACT = 262144
     SLIP = 1048576
     GRIP_TEST_FAILED = 2097152
     WRENCH_LIMIT = 4194304
     TIMEOUT = 16777216
+    NOT_CALIBRATED = 33554432
     RESTARTED = 536870912
 
 
@@ -218,6 +243,7 @@ class StatusReport:
     tip_position_a: Vec3  # m, base axes
     goal_theta: float  # rad
     goal_delta: float  # rad
+    calibration: CalibrationState = CalibrationState.UNKNOWN
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +254,15 @@ class Facts:
     tendons: tuple[TendonState, ...]
     requests: tuple[Request, ...] = ()
     bar: Bar | None = None  # newest target
+    calibration: Calibration = Calibration()
+
+
+@dataclass(frozen=True, slots=True)
+class TensionEstimate:
+    """Tension of one tendon from load and statics together."""
+
+    tension: float  # N
+    sigma: float  # N
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,3 +277,4 @@ class Commands:
     status: StatusReport
     wrench: WrenchReport
     recover: bool = False  # reboot and home the servos that need it: a person sees the arm hang straight
+    tensions: tuple[TensionEstimate, ...] = ()  # of each tendon by load and statics, for people to see

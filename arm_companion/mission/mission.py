@@ -3,6 +3,7 @@
 import dataclasses
 import math
 
+from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
 from arm_companion.mission import actions
 from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
@@ -17,11 +18,13 @@ from arm_companion.mission.facts import (
     Request,
     Result,
     Severity,
+    TensionEstimate,
 )
 from arm_companion.mission.perch import TABLE, TENSE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, Running, State
+from arm_companion.mission.state import Phase, Prediction, Running, State
+from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.wrench import predict
 
 _JOG_BEND = 1
@@ -77,6 +80,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         status_report(situation, prediction),
         prediction.wrench,
         recover,
+        _tensions(facts, state, prediction),
     )
     return state, commands
 
@@ -84,6 +88,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
 def _estimate(s: Situation) -> State:
     """The observers after this cycle."""
     state, perch = s.state, s.config.perch
+    expected = state.prediction.tensions if state.prediction is not None else ()
     force = (
         observe_force(state.force, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt) if s.vehicle_fresh else state.force
     )
@@ -94,6 +99,7 @@ def _estimate(s: Situation) -> State:
         state,
         force=force,
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
+        watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
     )
 
@@ -129,6 +135,8 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         s = s.remembering(dataclasses.replace(s.state, streaming=True, errors=ArmFault.NONE))
     if request.order in {Order.PERCH, Order.CLEAR_ERRORS}:
         s = s.remembering(dataclasses.replace(s.state, errors=ArmFault.NONE))
+    if request.order is Order.CLEAR_ERRORS:  # a person has looked at the tendons
+        s = s.remembering(dataclasses.replace(s.state, watch=()))
     if row.target is not phase:
         aborted = ArmFault.OPERATOR_ABORT if request.order is Order.ABORT else ArmFault.NONE
         s = _enter(s, row.target, f"order {name}", notices, aborted)
@@ -216,8 +224,20 @@ def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error
 def _warn(s: Situation, notices: list[Notice]) -> frozenset[str]:
     """Say once per phase what a person must know and no transition tells."""
     warned = s.state.warned
-    fault = s.servo_fault
-    if fault is not None and s.state.phase in TENSE and fault not in warned:
-        notices.append(Notice(Severity.CRITICAL, f"{fault}; the arm holds"))
-        warned |= {fault}
+    for fault in (s.servo_fault, s.tendon_fault):
+        if fault is not None and s.state.phase in TENSE and fault not in warned:
+            notices.append(Notice(Severity.CRITICAL, f"{fault}; the arm holds"))
+            warned |= {fault}
     return warned
+
+
+def _tensions(facts: Facts, state: State, prediction: Prediction) -> tuple[TensionEstimate, ...]:
+    """Tensions by load and statics together, where the statics know them and nothing contradicts them."""
+    if len(prediction.tensions) != len(facts.tendons) or len(state.watch) != len(facts.tendons):
+        return tuple(TensionEstimate(t.tension, t.tension_sigma) for t in facts.tendons)
+    return tuple(
+        TensionEstimate(*fuse((t.tension, t.tension_sigma), (says.tension, says.sigma)))
+        if says.exact and t.torque and t.homed and not suspect.fault
+        else TensionEstimate(t.tension, t.tension_sigma)
+        for t, says, suspect in zip(facts.tendons, prediction.tensions, state.watch, strict=True)
+    )

@@ -66,6 +66,16 @@ def servo_fault(s: Situation) -> str | None:
     return s.servo_fault
 
 
+def tendon_broken(s: Situation) -> str | None:
+    """A tendon carries nothing where the statics say that it must."""
+    return next((watched.broken for watched in s.state.watch if watched.broken), None)
+
+
+def tendon_jumped(s: Situation) -> str | None:
+    """A tendon's tension does not fit its displacement."""
+    return next((watched.jumped for watched in s.state.watch if watched.jumped), None)
+
+
 def _too_long(limit_s: float, what: str, s: Situation) -> str | None:
     return f"{what} took more than {limit_s:g} s" if s.elapsed > limit_s else None
 
@@ -239,7 +249,11 @@ def cannot_depart(s: Situation) -> str | None:
 
 def cannot_ready(s: Situation) -> str | None:
     """Why the arm cannot be made ready now."""
-    return s.servo_fault
+    if (fault := s.servo_fault) is not None:
+        return fault
+    if (fault := s.tendon_fault) is not None:
+        return f"{fault}; mend it, then CLEAR_ERRORS"
+    return s.facts.calibration.refusal or None
 
 
 def cannot_perch(s: Situation) -> str | None:
@@ -327,6 +341,18 @@ TABLE: Table[Phase, Situation] = Table(
             Phase.STOWING,
             "servo fault",
             ArmFault.SERVO_FAULT,
+        ),
+        *(
+            Row(phases, guard, target, name, error)
+            for guard, name, error in (
+                (tendon_broken, "tendon broken", ArmFault.TENDON_BROKEN),
+                (tendon_jumped, "tendon jumped", ArmFault.TENSION_DISAGREES),
+            )
+            for phases, target in (
+                (FREE_FLIGHT, Phase.DEPART),
+                (GRASPING | {Phase.VERIFY}, Phase.UNLOAD),
+                (frozenset({Phase.READYING, Phase.READY}), Phase.STOWING),
+            )
         ),
         Row(GRASPING | GRIPPED, overstressed, Phase.UNLOAD, "over-tension", ArmFault.TENDON_OVER_TENSION),
         Row(GRIPPED, wrench_over_limit, Phase.UNLOAD, "wrench limit", ArmFault.WRENCH_LIMIT),

@@ -3,7 +3,7 @@
 import math
 
 from arm_companion.mission import actions
-from arm_companion.mission.facts import ArmFault, ArmFlag, Control, StatusReport
+from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction
@@ -34,6 +34,7 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
         tip_position_a=prediction.tip_a,
         goal_theta=goal_theta,
         goal_delta=goal_delta,
+        calibration=s.facts.calibration.state,
     )
 
 
@@ -43,6 +44,7 @@ def _flags(s: Situation) -> ArmFlag:
     held = {
         ArmFlag.SERVOS_CONNECTED: bool(tendons) and not any(tendon.silent for tendon in tendons),
         ArmFlag.TORQUE_ON: bool(tendons) and all(tendon.torque for tendon in tendons),
+        ArmFlag.CALIBRATED: s.facts.calibration.state is CalibrationState.VALID,
         ArmFlag.VEHICLE_CONNECTED: vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s,
         ArmFlag.VEHICLE_STATE_FRESH: s.vehicle_fresh,
         ArmFlag.EXTERNAL_CONTROL: s.external,
@@ -64,6 +66,12 @@ def _present_faults(s: Situation) -> ArmFault:
         ArmFault.AUTOPILOT_FAILSAFE: vehicle.control is Control.FAILSAFE,
         ArmFault.SERVO_SILENT: any(tendon.silent for tendon in tendons),
         ArmFault.SERVO_FAULT: any(tendon.error_bits or not tendon.homed for tendon in tendons),
+        ArmFault.TENDON_SLACK: any(
+            t.torque and t.tension + 2.0 * t.tension_sigma < s.config.limits.tension_min_n for t in tendons
+        ),
+        ArmFault.TENDON_BROKEN: any(watched.broken for watched in s.state.watch),
+        ArmFault.TENSION_DISAGREES: any(watched.jumped for watched in s.state.watch),
+        ArmFault.NOT_CALIBRATED: bool(s.facts.calibration.refusal),
         ArmFault.TENDON_OVER_TENSION: any(t.tension > s.config.limits.tension_max_n for t in tendons),
     }
     return ArmFault(sum(fault.value for fault, present in there.items() if present))

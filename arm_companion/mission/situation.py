@@ -128,6 +128,11 @@ class Situation:
                 return f"tendon {i + 1}: servo does not follow goals"
         return None
 
+    @property
+    def tendon_fault(self) -> str | None:
+        """The first tendon that broke or jumped, in words."""
+        return next((watched.fault for watched in self.state.watch if watched.fault), None)
+
     @cached_property
     def bend(self) -> tuple[float, float]:
         """Bend that the measured displacements stand for, rad."""

@@ -7,6 +7,7 @@ from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, Vec3, WrenchReport
 from arm_companion.mission.motion import ZERO, Reference
+from arm_companion.mission.tendon_watch import Expected, TendonWatch
 from arm_companion.record_codec import UNRECORDED
 
 
@@ -86,6 +87,7 @@ class Prediction:
     tip_a: Vec3  # m, base axes
     bend: tuple[float, float]  # rad, that the measured displacements stand for
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
+    tensions: tuple[Expected, ...] = ()  # what the statics say of each tendon; empty when they say nothing
     # where the next solves start; they follow from what was recorded before, so they are not recorded themselves
     free: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
     anchored: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
@@ -109,6 +111,7 @@ class State:
     heading: float = 0.0  # rad, at which the vehicle faces the bar
     force: ForceObserver = ForceObserver()
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
+    watch: tuple[TendonWatch, ...] = ()  # of each tendon
     position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None
     rest: Vec3 | None = None  # m, where the anchored vehicle stays by itself; moves are counted from here

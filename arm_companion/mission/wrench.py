@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from arm_companion.arm import arc
+from arm_companion.arm import arc, statics
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind
 from arm_companion.arm.reaction import GRAVITY, BodyMotion, Reaction, Spread, reaction
+from arm_companion.arm.tension import statics_sigma
 from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
@@ -17,9 +18,14 @@ from arm_companion.mission.facts import Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
+from arm_companion.mission.tendon_watch import Expected
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
+_FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - {Phase.STARTUP, Phase.REACH}
+_FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
+_HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
+_HELD_TENSION_SIGMA = 1.0  # N, on top of it
 _LEAST_HZ = 5.0
 # the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
 _FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes
@@ -47,7 +53,16 @@ def predict(s: Situation) -> Prediction:
             held = anchored(s, s.state.position, None if last is None else last.anchored)
     solution = held if holding else free
     tip = _NAN3 if free is None else _vec3(free.tip_position)
-    return Prediction(s.t, _wrench(s, solution, holding=holding), tip, s.bend, _lean(s, solution), free, held)
+    return Prediction(
+        s.t,
+        _wrench(s, solution, holding=holding),
+        tip,
+        s.bend,
+        _lean(s, solution),
+        _tensions(s, free),
+        free,
+        held,
+    )
 
 
 def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:
@@ -57,6 +72,28 @@ def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:
         ModelError: no equilibrium was found.
     """
     return s.parameters.model.free(np.asarray(s.pulls), np.asarray(s.gravity_a), start=start)
+
+
+def _tensions(s: Situation, free: ArmSolution | None) -> tuple[Expected, ...]:
+    """What the statics say of the tendons' tensions.
+
+    Of a free arm the rod model knows them. Where a bar may be in the way, the unloaded arm's are what a tendon has
+    at least, roughly: a bar makes the tendon that grips it tighter and leaves the others about alone.
+    """
+    arm, zero_sigma = s.parameters.model.parameters, s.facts.calibration.zero_sigma
+    if s.state.phase in _FREE:
+        if free is None:
+            return ()
+        tension, spread, extra = free.tension, _FREE_TENSION_SPREAD, 0.0
+    elif s.state.phase is Phase.STARTUP:
+        return ()
+    else:
+        tension = statics.stretch_tension(arm, np.asarray(s.bend), np.asarray(s.pulls))
+        spread, extra = _HELD_TENSION_SPREAD, _HELD_TENSION_SIGMA
+    return tuple(
+        Expected(tau, math.hypot(statics_sigma(tau, k, zero_sigma, spread), extra), exact=s.state.phase in _FREE)
+        for tau, k in zip(tension.tolist(), arm.k_T.tolist(), strict=True)
+    )
 
 
 def grip(s: Situation) -> Anchor:

@@ -21,6 +21,8 @@ from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
 _DRAG_N_PER_M_S = 0.25
 _ROTARY_DRAG_NM_PER_RAD_S = 0.01
 
+_CUT_M = 100.0  # longer than any servo winds up
+
 Array = npt.NDArray[np.float64]
 
 
@@ -61,6 +63,7 @@ class Plant:
         self._qpos, self._qvel, self._applied = self._data.qpos, self._data.qvel, self._data.qfrc_applied[:6]
         self._lengths, self._rest = self._data.ten_length, model.tendon_lengthspring[:, 1]
         self._tendon_damping = model.tendon_damping
+        self._longer = np.zeros(model.ntendon)  # m, by what has happened to each tendon
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
         mujoco.mj_forward(model, self._data)
@@ -145,6 +148,14 @@ class Plant:
         """
         self._push = mjcf.up(force_w)
 
+    def cut_tendon(self, i: int) -> None:
+        """Cut tendon `i`, counted from 0: it pulls no more, whatever its servo does."""
+        self._longer[i] = _CUT_M
+
+    def slip_tendon(self, i: int, longer: float) -> None:
+        """Let tendon `i` jump: from now on it is `longer` m longer (negative: shorter) for the same pull."""
+        self._longer[i] += longer
+
     def _set_pulls(self, pulls: Sequence[float]) -> None:
         """Set the tendon springs' rest lengths, beyond which a tendon pulls; a slack tendon does not damp either.
 
@@ -154,7 +165,8 @@ class Plant:
         lengths, rest, bend = self._lengths, self._rest, self._bend
         total = self._stiffness * sum(longer for longer in (lengths - rest).tolist() if longer > 0.0)
         self._hinge_stiffness[:] = self._bending_stiffness + 2 * self._excess * total
-        np.subtract(self._straight_rest - self._excess * float(np.einsum("ij,ij->", bend, bend)), pulls, out=rest)
+        straight = self._straight_rest - self._excess * float(np.einsum("ij,ij->", bend, bend))
+        np.subtract(straight + self._longer, pulls, out=rest)
         np.multiply(lengths > rest, self._damping, out=self._tendon_damping)
 
     def _measure(self) -> PlantTruth:

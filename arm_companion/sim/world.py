@@ -9,6 +9,8 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.sim.autopilot import AutopilotStandIn
@@ -75,12 +77,17 @@ class World:
         config = self._config
         rotors = self.autopilot.control(self.plant.state(), _CONTROL_PERIOD_S)
         radius = config.arm.pulley_radius_m
-        self.servos.advance(_CONTROL_PERIOD_S, [radius * tension for tension in self.plant.tensions()])
+        tensions = self.plant.tensions()
+        if coupling := config.servos.coupling:
+            tensions = tuple((np.array(coupling).T @ tensions).tolist())
+        self.servos.advance(_CONTROL_PERIOD_S, [radius * tension for tension in tensions])
         pulls = [
             direction * (position - zero) / _TICKS_PER_RAD * radius
             for position, zero, direction in zip(
                 self.servos.positions(), config.servos.zero_ticks, config.servos.directions, strict=True
             )
         ]
+        if coupling:
+            pulls = (np.array(coupling) @ pulls).tolist()
         for _ in range(round(_CONTROL_PERIOD_S / config.sim.step_s)):
             self.plant.step(rotors, pulls)

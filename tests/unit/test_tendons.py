@@ -53,13 +53,13 @@ indices = st.integers(0, 3)
 @given(indices, st.floats(-0.12, 0.12))
 def test_ticks_and_pull_invert_each_other(i: int, pull: float) -> None:
     t = tendons()
-    assert t.pull(i, t.ticks(i, pull)) == pytest.approx(pull, abs=0.51 * TICK_RAD * RADIUS)
+    assert t.wound(i, t.ticks(i, pull)) == pytest.approx(pull, abs=0.51 * TICK_RAD * RADIUS)
 
 
 def test_one_turn_takes_in_one_circumference_in_the_servos_direction() -> None:
     t = tendons()
-    assert t.pull(0, 2048 + 4096) == pytest.approx(2 * math.pi * RADIUS)
-    assert t.pull(1, -3000 + 4096) == pytest.approx(-2 * math.pi * RADIUS)
+    assert t.wound(0, 2048 + 4096) == pytest.approx(2 * math.pi * RADIUS)
+    assert t.wound(1, -3000 + 4096) == pytest.approx(-2 * math.pi * RADIUS)
 
 
 def test_states_speak_of_tendons_not_of_servos() -> None:
@@ -77,26 +77,29 @@ def test_a_servo_never_heard_says_nothing_of_its_tendon() -> None:
 
 
 def test_tension_is_torque_over_radius_when_standing() -> None:
-    tension, sigma = tendons().tension(0.3, 0.0)
-    assert tension == pytest.approx(0.3 * SERVOS.load_torque_nm / RADIUS)
-    friction, noise = SERVOS.friction_torque_nm, SERVOS.load_sigma * SERVOS.load_torque_nm
-    assert sigma == pytest.approx(math.hypot(friction / math.sqrt(3), noise) / RADIUS)
+    standing = tendons().force(0, 0.3, 0.0, SERVOS.load_voltage_v)
+    torque = 0.3 * SERVOS.load_torque_nm
+    assert standing.value == pytest.approx(torque / RADIUS)
+    friction, noise = SERVOS.friction_torque_nm / math.sqrt(3), SERVOS.load_sigma * SERVOS.load_torque_nm
+    bias = math.hypot(friction, SERVOS.load_torque_sigma * torque)
+    assert standing.bias == pytest.approx(bias / RADIUS)
+    assert standing.sigma == pytest.approx(math.hypot(bias, noise) / RADIUS)
 
 
 def test_friction_is_taken_off_when_winding_in_and_added_when_letting_out() -> None:
     t = tendons()
-    inwards, standing, outwards = (t.tension(0.3, speed)[0] for speed in (0.02, 0.0, -0.02))
+    inwards, standing, outwards = (t.force(0, 0.3, speed, 12.0).value for speed in (0.02, 0.0, -0.02))
     friction_n = SERVOS.friction_torque_nm / RADIUS
     assert inwards == pytest.approx(standing - friction_n)
     assert outwards == pytest.approx(standing + friction_n)
-    assert t.tension(0.3, 0.02)[1] < t.tension(0.3, 0.0)[1]
+    assert t.force(0, 0.1, 0.02, 12.0).sigma < t.force(0, 0.1, 0.0, 12.0).sigma
 
 
 @given(st.floats(-1.0, 1.0), st.floats(-0.1, 0.1))
 def test_a_tendon_never_pushes(load: float, speed: float) -> None:
-    tension, sigma = tendons().tension(load, speed)
-    assert tension >= 0.0
-    assert sigma > 0.0
+    force = tendons().force(0, load, speed, 12.0)
+    assert force.value >= 0.0
+    assert force.sigma >= force.bias > 0.0
 
 
 # Goals.
@@ -106,7 +109,7 @@ def test_the_first_goals_are_where_the_tendons_are() -> None:
     t = tendons()
     t.states(servos((0.01, -0.02, 0.0, 0.005)))
     goals = t.goals((0.1, 0.1, 0.1, 0.1), 100.0)
-    assert [t.pull(i, g) for i, g in enumerate(goals)] == pytest.approx([0.01, -0.02, 0.0, 0.005], abs=1e-5)
+    assert [t.wound(i, g) for i, g in enumerate(goals)] == pytest.approx([0.01, -0.02, 0.0, 0.005], abs=1e-5)
     assert all(t.limited)
 
 
@@ -116,7 +119,7 @@ def test_goals_approach_what_is_wanted_at_the_speed_limit_and_reach_it() -> None
     wanted = (0.03, -0.03, 0.001, 0.0)
     now, path = 10.0, []
     for _ in range(200):
-        path.append([t.pull(i, g) for i, g in enumerate(t.goals(wanted, now))])
+        path.append([t.wound(i, g) for i, g in enumerate(t.goals(wanted, now))])
         now += 0.01
     step = LIMITS.pull_speed_m_per_s * 0.01
     for a, b in itertools.pairwise(path):
@@ -131,7 +134,7 @@ def test_a_pause_is_no_licence_to_jump() -> None:
     t.states(servos())
     t.goals((0.0,) * 4, 0.0)
     goals = t.goals((0.1,) * 4, 60.0)
-    assert t.pull(0, goals[0]) <= LIMITS.pull_speed_m_per_s * 0.1 + 1e-5
+    assert t.wound(0, goals[0]) <= LIMITS.pull_speed_m_per_s * 0.1 + 1e-5
 
 
 def test_after_a_rest_goals_start_from_where_the_tendons_have_gone() -> None:
@@ -141,7 +144,7 @@ def test_after_a_rest_goals_start_from_where_the_tendons_have_gone() -> None:
     t.rest()
     t.states(servos((0.02,) * 4))
     goals = t.goals((0.0,) * 4, 5.0)
-    assert t.pull(0, goals[0]) == pytest.approx(0.02, abs=1e-5)
+    assert t.wound(0, goals[0]) == pytest.approx(0.02, abs=1e-5)
 
 
 def test_an_over_tight_tendon_is_let_out_whatever_is_wanted() -> None:
@@ -151,18 +154,18 @@ def test_an_over_tight_tendon_is_let_out_whatever_is_wanted() -> None:
     tight = 1.2 * 20.0 * RADIUS / SERVOS.load_torque_nm
     t.states(servos(loads=(tight, 0.1, 0.1, 0.1)))
     goals = t.goals((0.05, 0.05, 0.0, 0.0), 0.01)
-    assert t.pull(0, goals[0]) < -1e-5
-    assert t.pull(1, goals[1]) > 1e-4
+    assert t.wound(0, goals[0]) < -1e-5
+    assert t.wound(1, goals[1]) > 1e-4
 
 
 def test_only_a_tendon_that_is_surely_slack_is_not_let_out() -> None:
-    sure = dataclasses.replace(SERVOS, load_sigma=0.0005, friction_torque_nm=0.0)
+    sure = dataclasses.replace(SERVOS, load_sigma=0.0005, friction_torque_nm=0.0, load_torque_sigma=0.0)
     for config, out in ((SERVOS, True), (sure, False)):
         t = Tendons(config, dataclasses.replace(LIMITS, tension_min_n=2.0), RADIUS)
         t.states(servos(loads=(0.0,) * 4))
         t.goals((0.0,) * 4, 0.0)
         goals = t.goals((-0.05,) * 4, 0.01)
-        assert (t.pull(0, goals[0]) < -1e-4) is out
+        assert (t.wound(0, goals[0]) < -1e-4) is out
 
 
 wild = st.floats(allow_nan=True, allow_infinity=True)
@@ -185,7 +188,7 @@ def test_no_request_breaks_a_limit(story: list[tuple[tuple[float, ...], float, l
     for wanted, pause, loads in story:
         now += pause
         t.states(servos(before, tuple(loads)))
-        pulls = tuple(t.pull(i, g) for i, g in enumerate(t.goals(wanted, now)))
+        pulls = tuple(t.wound(i, g) for i, g in enumerate(t.goals(wanted, now)))
         step = LIMITS.pull_speed_m_per_s * min(pause, 0.1)
         for old, new in zip(before, pulls, strict=True):
             assert abs(new) <= LIMITS.pull_max_m + 1e-5
