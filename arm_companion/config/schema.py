@@ -121,7 +121,7 @@ class VehicleConfig:
 class LinkConfig:
     """[links.NAME] One MAVLink connection."""
 
-    url: str = option("udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD")
+    url: str = option("udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD")
     role: str = option("who is at the other end", "ground", choices=("autopilot", "ground"))
 
 
@@ -129,7 +129,7 @@ class LinkConfig:
 class ServosConfig:
     """[servos] The Dynamixel bus and what each servo pulls."""
 
-    port: str = option("serial device of the bus", "/dev/ttyUSB0")
+    port: str = option("serial device of the bus, or tcp:HOST:PORT of a bridge to it", "/dev/ttyUSB0")
     baud: int = option("bits per second", 1_000_000, lower=9600, upper=4_500_000)
     ids: tuple[int, ...] = option("servo id of each tendon, in the tendons' order", (1, 2, 3, 4), lower=0, upper=252)
     directions: tuple[int, ...] = option(

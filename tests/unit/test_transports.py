@@ -204,7 +204,15 @@ def test_a_memory_pipe_keeps_the_order_of_what_is_written_at_one_instant() -> No
 
 
 @pytest.mark.parametrize(
-    "url", ["udpin:127.0.0.1:14540", "udpout:example.org:14550", "udpout:[::1]:14550", "serial:/dev/ttyAMA0:921600"]
+    "url",
+    [
+        "udpin:127.0.0.1:14540",
+        "udpout:example.org:14550",
+        "udpout:[::1]:14550",
+        "tcp:[::1]:5760",
+        "tcpin:0.0.0.0:5760",
+        "serial:/dev/ttyAMA0:921600",
+    ],
 )
 def test_good_urls_name_an_opener(url: str) -> None:
     assert callable(open_url(url))
@@ -223,7 +231,9 @@ def test_good_urls_name_an_opener(url: str) -> None:
         ("udpin:127.0.0.1:0", "port 0 is outside 1 to 65535"),
         ("udpout:127.0.0.1:65536", "port 65536 is outside"),
         ("serial:/dev/ttyAMA0:300", "baud 300 is outside"),
-        ("tcp:127.0.0.1:5760", "is not one of"),
+        ("tcp:127.0.0.1", "is not one of"),
+        ("tcpin:0.0.0.0:0", "port 0 is outside"),
+        ("tcpout:127.0.0.1:5760", "is not one of"),
     ],
 )
 def test_bad_urls_are_refused_with_the_forms_that_are_allowed(url: str, reason: str) -> None:
