@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup demo test scenarios check bench format clean
+.PHONY: help setup demo test scenarios soak check bench format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -24,10 +24,13 @@ demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated 
 	@$(BIN)/arm-companion sim perch --output build/demo
 
 test: $(STAMP)  ## run the tests
-	@$(BIN)/python -m pytest -m 'not scenario'
+	@$(BIN)/python -m pytest -m 'not scenario and not soak'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
 	@$(BIN)/python -m pytest -m scenario
+
+soak: $(STAMP)  ## an hour of hostile traffic in simulated time
+	@$(BIN)/python -m pytest -m soak
 
 check: $(STAMP)  ## lint, format, types and dependency directions
 	@$(BIN)/ruff check .
