@@ -29,7 +29,7 @@ test: $(STAMP)  ## run the tests
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
 	@$(BIN)/python -m pytest -m scenario
 
-soak: $(STAMP)  ## ten minutes of bus in simulated time, and 10,000 random questions to the mechanics, none answered wrong
+soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questions to the mechanics: none may go wrong
 	@$(BIN)/python -m pytest -m soak
 	@$(BIN)/python -m tests.soak
 

@@ -16,16 +16,21 @@ from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_telemetry import ServoTelemetry
+from arm_companion.drivers.settings import Settings, state_directory
+from arm_companion.drivers.signing_keys import SigningKeys
+from arm_companion.drivers.standard_services import Power
 from arm_companion.drivers.telemetry import Telemetry
-from arm_companion.drivers.tendons import Tendons
+from arm_companion.drivers.timesync import Timesync
+from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError, DeviceFault
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, State
+from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
@@ -35,6 +40,8 @@ log = logging.getLogger(__name__)
 
 _REARM_EVERY_S = 1.0
 _HEARTBEAT_FIRST_S = 0.1  # importing numba leaves the loop little time
+_FAREWELL_S = 0.3
+_AT_REST = frozenset({Phase.STARTUP, Phase.STOWED})
 _LEVELS = {
     Severity.CRITICAL: logging.CRITICAL,
     Severity.ERROR: logging.ERROR,
@@ -89,11 +96,29 @@ class Daemon:
         self._compiled_model = compiled_model
         self._parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
         self._links = [
-            MavlinkLink(name, link.role, openers.links[name], config.vehicle) for name, link in config.links.items()
+            MavlinkLink(name, link.role, openers.links[name], config.vehicle, config=link)
+            for name, link in config.links.items()
         ]
+        self._keys = SigningKeys(config)
+        self._keys.secure(self._links, clock)
+        self._forwarding = Forwarding([link for link in self._links if link.config.forward])
         (autopilot_link,) = (link for link in self._links if link.role == "autopilot")
-        self._autopilot = Autopilot(autopilot_link, config.vehicle)
-        self._component = Component(self._links, config.vehicle, clock)
+        self._timesync = Timesync(autopilot_link, clock)
+        self._autopilot = Autopilot(autopilot_link, config.vehicle, self._timesync)
+        self._settings = Settings(config, state_directory(config))
+        self._settings.stowed, self._settings.apply = self._why_not_stowed, self._apply
+        self._component = Component(
+            self._links,
+            config.vehicle,
+            clock,
+            mavlink=config.mavlink,
+            limits=config.limits,
+            settings=self._settings,
+            on_power=self._end,
+        )
+        self.vehicle_check = VehicleCheck(
+            autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
+        )
         self._telemetry = Telemetry(self._links, config.rates, clock)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
@@ -103,9 +128,7 @@ class Daemon:
             parked=self._calibrated.parked,
             parked_window=config.calibration.turned_ticks,
         )
-        self._tendons = Tendons(
-            self._calibrated.servos, config.limits, config.arm.pulley_radius_m, self._calibrated.curves
-        )
+        self._tendons = self._calibrated.tendons(config)
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
@@ -115,6 +138,9 @@ class Daemon:
         self.cycles = 0
         self.missed = 0
         self.failures = 0
+        self.power = Power.STOP
+        """What is to follow the end of `run`: another start, or nothing."""
+        self._stop = asyncio.Event()
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set, then leave the arm in the present phase's safe action.
@@ -122,12 +148,17 @@ class Daemon:
         Raises:
             BaseExceptionGroup: a part failed in a way that its owner cannot mend.
         """
+        self._stop = stop
         try:
             await run_until(
                 stop,
                 *(link.run for link in self._links),
                 self._autopilot.run,
+                self._timesync.run,
+                self.vehicle_check.run,
                 self._component.run,
+                self._settings.run,
+                self._keys.run,
                 self._bus.run,
                 self._cycles,
             )
@@ -145,6 +176,8 @@ class Daemon:
                 self._calibrated.close()
                 for link in self._links:
                     link.close()
+                self._settings.close()
+                self._keys.keep()
                 self._recorder.close()
 
     async def _prepare_model(self) -> None:
@@ -208,8 +241,20 @@ class Daemon:
         self._servo_telemetry.publish(now, servos, self._bus.counters)
         requests, bar = self._component.take()
         self._bar = bar or self._bar
-        calibration = self._calibrated.judge(self._bus.info, servos)
-        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar, calibration)
+        guidance = self._component.guidance
+        grasp_target, grasp_target_age_s = guidance.grasp_target
+        return Facts(
+            self._autopilot.state(now),
+            self._tendons.states(servos),
+            tuple(requests),
+            self._bar,
+            bar_age_s=guidance.bar_age_s,
+            grasp_target=grasp_target,
+            grasp_target_age_s=grasp_target_age_s,
+            arm_setpoint=guidance.setpoint,
+            ground_age_s=self._component.access.ground_age_s,
+            calibration=self._calibrated.judge(self._bus.info, servos),
+        )
 
     async def _rearm(self) -> None:
         """Servos stopped where they were because the bus was silent; goals go on from there."""
@@ -251,7 +296,17 @@ class Daemon:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
-        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls, commands.tensions)
+        self._telemetry.holder = self._component.access.holder
+        self._telemetry.publish(
+            now,
+            commands.status,
+            facts.tendons,
+            commands.wrench,
+            commands.pulls,
+            tensions=commands.tensions,
+            stiffness=commands.stiffness,
+            payload=commands.payload,
+        )
 
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""
@@ -267,6 +322,26 @@ class Daemon:
                 self._component.notify(Notice(Severity.CRITICAL, text))
         except Exception:
             log.exception("the safe action failed too")
+
+    # --- what the ground may change ---
+
+    def _why_not_stowed(self) -> str | None:
+        phase = self._state.phase
+        return None if phase in _AT_REST else f"it is {phase.name}"
+
+    def _apply(self, config: Config) -> None:
+        """Another configuration is in force; only values of `config.parameters` differ."""
+        if config.limits != self._config.limits:
+            self._tendons = self._calibrated.tendons(config)
+            self._component.set_limits(config.limits)
+        self._config = config
+        self._parameters = Parameters(config, self._parameters.model)
+        self._telemetry.set_rates(config.rates)
+
+    def _end(self, power: Power) -> None:
+        """Stop in an orderly way, a moment later: the answer to whoever asked has to leave first."""
+        self.power = power
+        asyncio.get_running_loop().call_later(_FAREWELL_S, self._stop.set)
 
 
 def _recorder(config: Config, clock: Clock) -> Recorder:

@@ -7,6 +7,7 @@ from arm_companion.drivers import calibration_files as files
 from arm_companion.drivers.calibration import TendonCalibration, apply, curves, judge, misfit, too_old
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.servo_setup import ServoInfo
+from arm_companion.drivers.tendons import Tendons
 from arm_companion.mission.facts import Calibration
 
 
@@ -63,6 +64,10 @@ class Calibrated:
             self._key = key
             self._judgement = judge(self._tendons, self._config, found, servos, self.parked)
         return self._judgement
+
+    def tendons(self, config: Config) -> Tendons:
+        """The tendons as calibrated, within the limits of `config`, which a parameter can change."""
+        return Tendons(self.servos, config.limits, config.arm.pulley_radius_m, self.curves)
 
     def close(self) -> None:
         """Keep where the servos stand."""

@@ -79,8 +79,9 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         tuple(notices),
         status_report(situation, prediction),
         prediction.wrench,
-        recover,
-        _tensions(facts, state, prediction),
+        recover=recover,
+        tensions=_tensions(facts, state, prediction),
+        stiffness=prediction.stiffness,
     )
     return state, commands
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
-from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, Vec3, WrenchReport
+from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
 from arm_companion.mission.motion import ZERO, Reference
 from arm_companion.mission.tendon_watch import Expected, TendonWatch
 from arm_companion.record_codec import UNRECORDED
@@ -91,6 +91,7 @@ class Prediction:
     # where the next solves start; they follow from what was recorded before, so they are not recorded themselves
     free: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
     anchored: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
+    stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,13 +6,14 @@ from arm_companion.errors import ConfigError
 from arm_companion.transport.base import Opener
 from arm_companion.transport.serial import open_serial
 from arm_companion.transport.tcp import tcp_in, tcp_out
-from arm_companion.transport.udp import udp_in, udp_out
+from arm_companion.transport.udp import udp_broadcast, udp_in, udp_out
 
-FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD"
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD"
 
 _SOCKETS: dict[str, Callable[[str, int], Opener]] = {
     "udpin": udp_in,
     "udpout": udp_out,
+    "udpbcast": udp_broadcast,
     "tcp": tcp_out,
     "tcpin": tcp_in,
 }

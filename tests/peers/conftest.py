@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 import pytest
 
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, ticks
+from arm_companion.config import Config
 from arm_companion.config.schema import RatesConfig, VehicleConfig
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink
+from arm_companion.drivers.settings import Settings
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.mission.facts import (
     Answer,
@@ -79,9 +81,10 @@ def serve() -> Callable[[], contextlib.AbstractAsyncContextManager[Harness]]:
             probe.bind((HOST, 0))
             port = int(probe.getsockname()[1])
         vehicle = VehicleConfig()
+        settings = Settings(Config())
         clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
         link = MavlinkLink("ground", "ground", open_url(f"udpout:{HOST}:{port}"), vehicle)
-        component = Component([link], vehicle, clock)
+        component = Component([link], vehicle, clock, settings=settings)
         harness = Harness(port, component, link)
         parts = (link.run(), component.run(), harness.cycles(Telemetry([link], RatesConfig(), clock)))
         tasks = [asyncio.create_task(part) for part in parts]
