@@ -230,8 +230,7 @@ class Rod:
         Sixth-order Magnus steps on every interval, in (u_x, u_y, u_z), which are section axes turned by a
         quarter about the tangent; then products by doubling.
         """
-        # With a1, a2, a3 of `Mesh.steps`: turn = a1 + a3/12 + (20 a1 + a3 + c1) x (a2 + c2/60) / 240,
-        # c1 = a1 x a2, c2 = a1 x (2 a3 - c1); the tables hold the combinations, and every product is two rows shorter.
+        # turn = a1 + a3/12 + (20 a1 + a3 + c1) x (a2 + c2/60) / 240, c1 = a1 x a2, c2 = a1 x (2 a3 - c1)
         mixed = (x @ self._steps)[_WRAP_THRICE]
         k = mixed.shape[1] // 6
         a, b, c, d, e, f = (mixed[:, i * k : (i + 1) * k] for i in range(6))

@@ -28,8 +28,12 @@ class _RefusedError(ArmError):
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of `arm-companion calibrate`."""
+    """Options of `arm-companion calibrate`; every calibration sets `calibrate`, which does it."""
     commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT", parser_class=NumberParser)
+    _add_stiffness(commands)
+
+
+def _add_stiffness(commands: "argparse._SubParsersAction[NumberParser]") -> None:
     sub = commands.add_parser(
         "stiffness",
         help="EI, tendon stiffness, pretension and guide friction from a loading test",
@@ -37,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         epilog=loading_csv.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    sub.set_defaults(calibrate=_stiffness)
     sub.add_argument("data", type=Path, metavar="DATA.csv", help="the measurements; columns below")
     add_config_arguments(sub, default="zhao2022.toml")
     sub.add_argument(
@@ -70,10 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fit; exit code 2 with one line on standard error when data or arguments are refused."""
+    """Calibrate; exit code 2 with one line on standard error when data or arguments are refused."""
     config = load_from(arguments)
     try:
-        return _stiffness(arguments, config)
+        code: int = arguments.calibrate(arguments, config)
     except ConfigError:
         raise
     except loading_csv.DataError as error:
@@ -86,10 +91,13 @@ def run(arguments: argparse.Namespace) -> int:
         if error.filename is None:  # not a file of ours, such as a closed pipe
             raise
         print(f"arm-companion calibrate: {error.filename}: {error.strerror}", file=sys.stderr)
+    else:
+        return code
     return 2
 
 
 def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
+    """Fit EI, k_T, T0 and friction to a loading test."""
     if arguments.figure is not None and importlib.util.find_spec("matplotlib") is None:
         raise _RefusedError("--figure needs 'matplotlib': pip install 'arm-companion[sim]'")
     if arguments.output is not None and arguments.settings:

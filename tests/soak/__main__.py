@@ -1,8 +1,8 @@
 """`python -m tests.soak`, that is `make soak`: random cases of the rod model, none of them wrong and silent.
 
 Every answer is checked by `tests.soak.check`, which knows nothing of the solver; every refusal is counted with its
-reason. Exit code 1 when an answer is wrong. In parts: `--seed` begins another series, and a case is told by the seed
-and number printed with it.
+reason. Exit code 1 when an answer is wrong. In parts: `--seed` begins another series, `--first` goes on with one,
+and a case is told by the seed and number printed with it.
 """
 
 import argparse
@@ -120,13 +120,18 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m tests.soak", description="Random cases of the rod model.")
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0, help="number of the first case; ten share an arm")
     parser.add_argument("--numpy", action="store_true", help="without numba")
     parser.add_argument("--output", type=Path, help="write the tally as JSON")
     arguments = parser.parse_args()
     fast = not arguments.numpy and importlib.util.find_spec("numba") is not None
     tally = Tally()
-    for case, model in cases(arguments.seed, arguments.cases, fast=fast):
+    told = 0
+    for case, model in cases(arguments.seed, arguments.cases, first=arguments.first, fast=fast):
         judge(case, model, tally)
+        if len(tally.wrong) > told:
+            told = len(tally.wrong)
+            sys.stderr.write(f"wrong: {tally.wrong[-1]}\n")
         if tally.cases % 1000 == 0:
             sys.stderr.write(f"{tally.cases} cases, {tally.solved} solved, {len(tally.wrong)} wrong\n")
     again = f"{tally.compared} with sharp bends were solved again with more modes"

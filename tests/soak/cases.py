@@ -61,10 +61,10 @@ def arm(rng: np.random.Generator) -> ArmParameters:
     return ArmParameters(tuple(segments), tuple(tendons), guides)
 
 
-def cases(seed: int, count: int, *, fast: bool) -> Iterator[tuple[Case, RodModel]]:
+def cases(seed: int, count: int, *, fast: bool, first: int = 0) -> Iterator[tuple[Case, RodModel]]:
     """Questions and the model to ask; ten to every arm."""
-    number = 0
-    while number < count:
+    number = first - first % 10
+    while number < first + count:
         rng = np.random.default_rng((seed, number))
         P = arm(rng)
         model = RodModel(P, fast=fast)

@@ -85,7 +85,7 @@ def defects(asked: Asked, solution: ArmSolution) -> Defects:
         first_at = first + np.vstack((np.zeros(3), np.cumsum(piece, axis=0)))  # of the mass before every edge
         n = N0 - np.outer(mass + segment.line_mass * (edges - before), g)
         m = M0 - np.cross(p, n) - np.cross(first_at, g)
-        ends, grown = _integrated(P, k, segment, solution.tension, R[:-1], p[:-1], n[:-1], m[:-1], g, h)
+        ends, grown = _integrated(P, k, segment, solution.tension, R, p, n, m, g, h)
         longer += grown
         turn = np.sqrt(np.abs(3 - np.einsum("kij,kij->k", ends[0], R[1:])))  # |angle| = sqrt(3 - tr) for small ones
         stiff = min(segment.EI, segment.GJ)
@@ -118,7 +118,10 @@ def _integrated(P, k, segment, tension, R, p, n, m, g, h):
     tau, angle = tension[here], P.angles[here]
     offsets = segment.r * np.column_stack((np.cos(angle), np.sin(angle), np.zeros(angle.size)))
     gap2 = (segment.L / segment.disks) ** 2 / 24 if P.guides is Guides.DISKS else 0.0
-    guess = np.zeros_like(m)
+    # The law may have another root where a tendon runs near the centre of curvature: begin near the one that is told.
+    turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])
+    guess = 0.5 / h * np.stack([turn[:, i, j] - turn[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    R, p, n, m = R[:-1], p[:-1], n[:-1], m[:-1]
 
     def slope(state):
         nonlocal guess
