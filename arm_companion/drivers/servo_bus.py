@@ -179,12 +179,19 @@ class ServoBus:
         async with self._setting_up:
             info = await set_up(self._link, record, self._settings)
             if record.id not in self.info:
-                near, window = self._zeros[record.id], self._config.home_window_ticks
-                if record.id in self._parked:
-                    near, window = self._parked[record.id], self._parked_window
-                await adopt(self._link, record, near, window)
+                await self._meet(record)
             self.info[record.id] = info
             record.set_up = True
+
+    async def _meet(self, record: ServoRecord) -> None:
+        """Decide whether a servo's turns can be believed; while another one holds, the arm need not hang straight."""
+        deadline = asyncio.get_running_loop().time() + self._config.reply_timeout_s
+        await self._reader.check_torque(self._records, deadline)
+        at_rest = not any(other.torque for other in self._records if other is not record)
+        near, window = self._zeros[record.id], self._config.home_window_ticks
+        if record.id in self._parked:
+            near, window = self._parked[record.id], self._parked_window
+        await adopt(self._link, record, near, window if at_rest else -1)
 
     def _report(self, servo: int, trouble: str) -> None:
         """Log what is wrong once, and once that it is over."""

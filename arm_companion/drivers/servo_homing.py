@@ -23,7 +23,13 @@ async def adopt(link: ServoLink, record: ServoRecord, zero: int, window: int) ->
 
     It can where someone vouched for it before (LED), and where the torque is on, which no servo has after a loss
     of power. Otherwise the arm is taken to hang straight, each tendon near its zero: a servo within `window` of
-    it (ticks, whole turns aside) is homed there, and another has lost its turns.
+    it is homed there, and another has lost its turns.
+
+    Args:
+        link: the bus.
+        record: of the servo, just set up.
+        zero: ticks.
+        window: ticks, whole turns aside; -1: nothing is taken for granted.
 
     Raises:
         DeviceFault: it is silent, or refuses.

@@ -16,8 +16,10 @@ from arm_companion.config.schema import ServosConfig
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError, Register
 from arm_companion.protocol.dynamixel import StatusError
+from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_device import BOOT_S
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
+from arm_companion.sim.servo_faults import ByteDelay, heat, seize
 
 pytestmark = pytest.mark.realtime
 CONFIG = ServosConfig()
@@ -27,8 +29,9 @@ IDS = CONFIG.ids
 class Client:
     """The SDK on an open port, with its results checked."""
 
-    def __init__(self, path: Path, emulator: ServoEmulator) -> None:
-        self.emulator = emulator
+    def __init__(self, path: Path, bus: EmulatedBus) -> None:
+        self.bus = bus
+        self.emulator = bus.emulator
         self.port = sdk.PortHandler(str(path))
         self.handler = sdk.PacketHandler(2.0)
         assert self.port.setBaudRate(CONFIG.baud)
@@ -52,7 +55,20 @@ class Client:
             time.sleep(0.01)
 
 
+def feedback_group(client: Client) -> "sdk.GroupSyncRead":
+    group = sdk.GroupSyncRead(client.port, client.handler, ct.FEEDBACK_ADDRESS, ct.FEEDBACK_SIZE)
+    for servo in IDS:
+        assert group.addParam(servo)
+    return group
+
+
 Play = Callable[[Callable[[Client], None]], None]
+
+
+@pytest.fixture(autouse=True)
+def _patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The SDK waits for two of its 16 ms beyond the wire, which is too short where others compute as well."""
+    monkeypatch.setattr("dynamixel_sdk.port_handler.LATENCY_TIMER", 100)
 
 
 @pytest.fixture
@@ -67,7 +83,7 @@ def play(tmp_path: Path) -> Iterator[Play]:
         await bus.wait_ready()
 
         def run() -> None:
-            client = Client(path, emulator)
+            client = Client(path, bus)
             try:
                 talk(client)
             finally:
@@ -163,9 +179,7 @@ def test_sync_write_moves_all_and_sync_read_sees_it(play: Play) -> None:
 
 def test_the_daemons_own_block_can_be_read_by_sync_and_fast_sync_read(play: Play) -> None:
     def talk(client: Client) -> None:
-        group = sdk.GroupSyncRead(client.port, client.handler, ct.FEEDBACK_ADDRESS, ct.FEEDBACK_SIZE)
-        for servo in IDS:
-            group.addParam(servo)
+        group = feedback_group(client)
         for call in (group.txRxPacket, group.fastSyncRead):
             assert call() == sdk.COMM_SUCCESS
             for servo in IDS:
@@ -228,5 +242,94 @@ def test_the_watchdog_stops_a_servo_whose_master_fell_silent(play: Play) -> None
         assert client.write(1, ct.GOAL_POSITION, 2100) == StatusError.DATA_RANGE
         assert client.write(1, ct.BUS_WATCHDOG, 0) == 0
         assert client.write(1, ct.GOAL_POSITION, 2100) == 0
+
+    play(talk)
+
+
+def test_old_firmware_answers_a_sync_read_and_no_fast_one(play: Play) -> None:
+    def talk(client: Client) -> None:
+        client.emulator[3].poke(ct.FIRMWARE_VERSION, 44)
+        group = feedback_group(client)
+        assert group.fastSyncRead() != sdk.COMM_SUCCESS
+        assert group.txRxPacket() == sdk.COMM_SUCCESS
+
+    play(talk)
+
+
+def test_a_profile_limits_speed_and_the_trajectory_can_be_read(play: Play) -> None:
+    def talk(client: Client) -> None:
+        assert client.write(2, ct.PROFILE_VELOCITY, 100) == 0
+        assert client.write(2, ct.PROFILE_ACCELERATION, 20) == 0
+        assert client.write(2, ct.TORQUE_ENABLE, 1) == 0
+        assert client.write(2, ct.GOAL_POSITION, 2048 + 4096) == 0
+        client.wait_for(lambda: client.read(2, ct.VELOCITY_TRAJECTORY) == 100)
+        assert client.read(2, ct.MOVING) == 1
+        assert 2048 < client.read(2, ct.POSITION_TRAJECTORY) < 2048 + 4096
+        assert client.read(2, ct.PRESENT_VELOCITY) < 115
+
+    play(talk)
+
+
+def test_a_brown_out_alerts_and_a_deep_one_restarts_the_servo(play: Play) -> None:
+    def talk(client: Client) -> None:
+        assert client.write(1, ct.LED, 1) == 0
+        client.emulator.supply_v = 5.5
+        alert = sdk.protocol2_packet_handler.ERRBIT_ALERT
+        client.wait_for(lambda: client.handler.ping(client.port, 1)[2] == alert)
+        assert client.read(1, ct.HARDWARE_ERROR_STATUS) == HardwareError.INPUT_VOLTAGE
+        assert client.read(1, ct.PRESENT_VOLTAGE) == 55
+        client.emulator.supply_v = 3.0
+        client.wait_for(lambda: client.handler.ping(client.port, 1)[1] == sdk.COMM_RX_TIMEOUT)
+        client.emulator.supply_v = 12.0
+        client.wait_for(lambda: client.handler.ping(client.port, 1)[1:] == (sdk.COMM_SUCCESS, 0))
+        assert client.read(1, ct.LED) == 0, "RAM is as after power-up"
+
+    play(talk)
+
+
+def test_overheating_and_a_stuck_horn_let_go_and_alert(play: Play) -> None:
+    def talk(client: Client) -> None:
+        for servo in (1, 2):
+            assert client.write(servo, ct.TORQUE_ENABLE, 1) == 0
+        heat(client.emulator[1], 80.0)
+        seize(client.emulator[2])
+        assert client.write(2, ct.GOAL_POSITION, 4000) & 0x7F == 0
+        client.wait_for(lambda: client.read(1, ct.TORQUE_ENABLE) == 0)
+        assert client.read(1, ct.HARDWARE_ERROR_STATUS) == HardwareError.OVERHEATING
+        assert client.read(1, ct.PRESENT_TEMPERATURE) > 72
+        client.wait_for(lambda: client.read(2, ct.HARDWARE_ERROR_STATUS) == HardwareError.OVERLOAD, 8.0)
+        assert client.write(2, ct.TORQUE_ENABLE, 1) & 0x7F == StatusError.RESULT_FAIL
+
+    play(talk)
+
+
+def test_silence_noise_and_late_bytes_are_errors_that_the_sdk_names(play: Play) -> None:
+    def talk(client: Client) -> None:
+        client.emulator[4].silenced = True
+        assert client.handler.ping(client.port, 4)[1] == sdk.COMM_RX_TIMEOUT
+        assert client.write(3, ct.LED, 1) == 0
+        client.emulator[4].silenced = False
+        client.bus.to_master = ByteNoise(corrupt=0.2, seed=1)
+        results = {client.handler.ping(client.port, 4)[1] for _ in range(10)}
+        assert results <= {sdk.COMM_SUCCESS, sdk.COMM_RX_TIMEOUT, sdk.COMM_RX_CORRUPT}
+        assert results - {sdk.COMM_SUCCESS}
+        client.bus.to_master = lambda data: data
+        client.bus.delays = ByteDelay(0.1, 0.002, seed=2)
+        assert client.handler.ping(client.port, 4) == (1060, sdk.COMM_SUCCESS, 0), "the SDK waits long enough"
+
+    play(talk)
+
+
+def test_a_new_id_and_speed_hold_for_the_sdk_too(play: Play) -> None:
+    def talk(client: Client) -> None:
+        handler, port = client.handler, client.port
+        handler.write1ByteTxOnly(port, 2, ct.ID.address, 42)
+        client.wait_for(lambda: handler.ping(port, 42)[1] == sdk.COMM_SUCCESS)
+        assert handler.ping(port, 2)[1] == sdk.COMM_RX_TIMEOUT
+        handler.write1ByteTxOnly(port, 42, ct.BAUD_RATE.address, 2)
+        client.wait_for(lambda: handler.ping(port, 42)[1] == sdk.COMM_RX_TIMEOUT)
+        assert port.setBaudRate(115_200)
+        assert handler.ping(port, 42) == (1060, sdk.COMM_SUCCESS, 0)
+        assert handler.ping(port, 1)[1] == sdk.COMM_RX_TIMEOUT
 
     play(talk)

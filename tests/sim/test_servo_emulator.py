@@ -18,6 +18,7 @@ from arm_companion.protocol.dynamixel import StatusError
 from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_device import BOOT_S
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator
+from arm_companion.sim.servo_faults import ByteDelay, heat, seize, set_free
 from arm_companion.sim.servo_motion import FRICTION, Trajectory
 from arm_companion.transport.base import Transport
 from arm_companion.transport.memory import MemoryPipe
@@ -170,6 +171,65 @@ def test_fast_sync_read_holds_the_same_data(master: Master) -> None:
     ]
     master.emulator[3].silenced = True
     assert master.send(request) == []  # the frame breaks off where the servo is missing
+
+
+def test_old_firmware_knows_no_fast_sync_read_and_older_no_watchdog(master: Master) -> None:
+    request = dxl.sync_read((1, 2), ct.GOAL_POSITION.address, 4, fast=True)
+    master.emulator[2].poke(ct.FIRMWARE_VERSION, 44)
+    assert master.send(request) == []
+    assert len(master.send(dxl.sync_read((1, 2), ct.GOAL_POSITION.address, 4))) == 2
+    assert master.write(2, ct.BUS_WATCHDOG, 10) == StatusError.NONE
+    master.emulator[2].poke(ct.FIRMWARE_VERSION, 37)
+    assert master.write(2, ct.BUS_WATCHDOG, 10) == StatusError.ACCESS
+
+
+def test_two_servos_with_one_id_answer_over_each_other(master: Master) -> None:
+    master.emulator.servos[1].poke(ct.ID, 1)
+    (answer,) = master.send(dxl.ping(1))
+    assert answer.id == 1  # both say the same
+    master.emulator.servos[1].motor.position += 1000.0
+    assert master.send(dxl.read(1, ct.PRESENT_POSITION.address, 4)) == []
+    master.set(1, ct.LED, 1)  # both obey
+    assert [servo.peek(ct.LED) for servo in master.emulator.servos] == [1, 1, 0, 0]
+
+
+def test_a_seized_horn_strains_without_turning_until_it_shuts_down(master: Master) -> None:
+    seize(master.emulator[1])
+    master.set(1, ct.TORQUE_ENABLE, 1)
+    master.set(1, ct.GOAL_POSITION, 4000)
+    master.wait(1.0)
+    assert master.read(1, ct.PRESENT_POSITION) == 2048
+    assert master.read(1, ct.PRESENT_LOAD) > 850
+    master.wait(2.0)
+    assert master.emulator[1].peek(ct.HARDWARE_ERROR_STATUS) == HardwareError.OVERLOAD
+    set_free(master.emulator[1])
+    master.send(dxl.reboot(1))
+    master.wait(BOOT_S + 0.02)
+    master.set(1, ct.TORQUE_ENABLE, 1)
+    master.set(1, ct.GOAL_POSITION, 2500)
+    master.wait(2.0)
+    assert master.read(1, ct.PRESENT_POSITION) == pytest.approx(2500, abs=8)
+
+
+def test_heat_above_the_limit_lets_go_and_goes_away_by_itself(master: Master) -> None:
+    master.set(1, ct.TORQUE_ENABLE, 1)
+    heat(master.emulator[1], 73.0)
+    master.wait(0.02)
+    assert master.emulator[1].peek(ct.HARDWARE_ERROR_STATUS) == HardwareError.OVERHEATING
+    assert master.emulator[1].peek(ct.TORQUE_ENABLE) == 0
+    master.wait(10.0)
+    assert 65 < master.emulator[1].peek(ct.PRESENT_TEMPERATURE) < 72
+    assert master.emulator[1].peek(ct.TORQUE_ENABLE) == 0
+
+
+def test_delayed_bytes_come_whole_in_order_and_late() -> None:
+    delay = ByteDelay(0.1, 0.002, seed=3)
+    data = bytes(range(256))
+    pieces = delay(data)
+    assert b"".join(piece for _, piece in pieces) == data
+    assert 10 < len(pieces) < 45
+    assert all(pause == 0.002 for pause, _ in pieces[1:])
+    assert ByteDelay(0.0, 0.002)(data) == [(0.0, data)]
 
 
 def test_reg_write_waits_for_action(master: Master) -> None:

@@ -206,6 +206,21 @@ def test_a_fast_sync_answer_is_the_makers() -> None:
         assert int.from_bytes(made[end - 2 : end], "little") == bitwise_crc(made[: end - 2])
 
 
+@given(fast_items, st.integers(0, 1000), st.integers(1, 255), st.booleans())
+def test_a_damaged_fast_sync_answer_gives_nothing_and_the_next_is_found(
+    sized: tuple[int, list[tuple[int, int, bytes]]], at: int, change: int, cut: bool
+) -> None:
+    size, items = sized
+    good = dxl.fast_sync_answer(items)
+    at %= len(good)
+    damaged = good[:at] + good[at + 1 :] if cut else good[:at] + bytes((good[at] ^ change,)) + good[at + 1 :]
+    parser = Parser()
+    assert all(p.id != dxl.BROADCAST_ID or p.instruction != Instruction.STATUS for p in parser.feed(damaged))
+    parser.reset()  # as the driver does before it asks again
+    (packet,) = parser.feed(good)
+    assert dxl.split_fast_sync_answer(packet, size) == [Packet(i, Instruction.STATUS, e, d) for i, e, d in items]
+
+
 def test_a_fast_sync_answer_of_another_size_is_refused() -> None:
     (packet,) = Parser().feed(dxl.fast_sync_answer([(1, 0, b"1234")]))
     with pytest.raises(ProtocolError, match="does not hold"):

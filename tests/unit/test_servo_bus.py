@@ -5,6 +5,7 @@ import dataclasses
 import itertools
 import math
 import random
+import socket
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,8 @@ from arm_companion.sim.servo_device import BOOT_S
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.transport.base import Receiver, Transport
 from arm_companion.transport.memory import MemoryPipe
-from arm_companion.transport.serial import open_serial
+from arm_companion.transport.tcp import tcp_in
+from arm_companion.transport.urls import open_bus
 
 CONFIG = ServosConfig()
 PERIOD_S = 0.01
@@ -706,14 +708,23 @@ async def until(bus: ServoBus, reached: Callable[[ServoState], bool], goals: Seq
 
 
 @pytest.mark.realtime
-def test_the_same_over_a_pty_in_real_time(tmp_path: Path) -> None:
+@pytest.mark.parametrize("way", ["pty", "tcp"])
+def test_the_same_over_a_port_in_real_time(tmp_path: Path, way: str) -> None:
     async def main() -> None:
         emulator = ServoEmulator(CONFIG)
         wire = EmulatedBus(emulator, CONFIG)
         passing = asyncio.create_task(keep_time(emulator))
-        serving = asyncio.create_task(wire.serve_pty(tmp_path / "bus"))
+        if way == "pty":
+            port = str(tmp_path / "bus")
+            serving = asyncio.create_task(wire.serve_pty(port))
+        else:
+            with socket.socket() as probe:
+                probe.bind(("127.0.0.1", 0))
+                number = int(probe.getsockname()[1])
+            port = f"tcp:127.0.0.1:{number}"
+            serving = asyncio.create_task(wire.serve(tcp_in("127.0.0.1", number)))
         await wire.wait_ready()
-        bus = ServoBus(open_serial(str(tmp_path / "bus"), CONFIG.baud), CONFIG)
+        bus = ServoBus(open_bus(port, CONFIG.baud), CONFIG)
         running = asyncio.create_task(bus.run())
         await until(bus, lambda s: s.ready, None)
         await until(bus, lambda s: abs(s.position - 2148) < 10, (2148,) * 4)

@@ -333,6 +333,14 @@ def test_a_servo_far_from_its_zero_at_power_up_is_not_believed_by_this_daemon_no
         assert [state.turns_lost for state in states] == [False, True, False, False]
 
 
+def test_beside_a_servo_that_holds_nothing_is_taken_for_granted() -> None:
+    def hold(arm: Arm) -> None:
+        arm.emulator[4].poke(ct.TORQUE_ENABLE, 1)
+
+    for states in start(hold):
+        assert [state.turns_lost for state in states] == [True, True, True, False]
+
+
 def test_homing_needs_the_torque_off() -> None:
     async def play(arm: Arm) -> None:
         with pytest.raises(DeviceFault, match="torque is on"):

@@ -3,11 +3,13 @@
 import asyncio
 import dataclasses
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
 
 import pytest
+import serial
 
 from arm_companion.__main__ import main
 from arm_companion.cli import servos as command
@@ -289,6 +291,17 @@ def test_monitor_writes_nothing(bench: Bench) -> None:
     assert call("monitor", "--once") == 0
     for servo, values in zip(bench.emulator.servos, before, strict=True):
         assert all(servo.values[a] == v for a, v in values.items() if ct.REGISTERS[a].writable)
+
+
+@pytest.mark.parametrize("words", [["scan"], ["setup", "--yes"], ["monitor", "--once"]])
+def test_a_port_that_the_daemon_holds_is_refused(capsys: pytest.CaptureFixture[str], words: list[str]) -> None:
+    master, slave = os.openpty()
+    port = os.ttyname(slave)
+    with serial.Serial(port, exclusive=True):
+        assert main(["servos", *words, "--config", "sim.toml", "--port", port]) == 1
+    assert "another program holds its lock" in capsys.readouterr().err
+    os.close(master)
+    os.close(slave)
 
 
 @pytest.mark.parametrize(
