@@ -1,4 +1,4 @@
-"""`arm-companion calibrate`: fit the model to measurements of the real arm."""
+"""`arm-companion calibrate`: the tendons on the bench, and the model from measurements of the real arm."""
 
 import argparse
 import importlib.util
@@ -12,6 +12,7 @@ from arm_companion.arm import identification
 from arm_companion.arm.identification import Fit, LoadingTest
 from arm_companion.arm.parameters import Guides
 from arm_companion.arm.rod_model import RodModel
+from arm_companion.cli import calibrate_tendons, calibrate_tension
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.cli.numbers import NumberParser
 from arm_companion.config import Config, load
@@ -20,6 +21,7 @@ from arm_companion.errors import ArmError, ConfigError
 from arm_companion.experiments import case, loading_csv
 
 _UNITS = {"EI": "N m^2", "k_T": "N/m", "T0": "N", "mu": ""}
+_GUIDED = {"tendons": calibrate_tendons.run, "tension": calibrate_tension.run}
 _KEYS = {"EI": "EI_n_m2", "k_T": "k_T_n_per_m", "T0": "T0_n", "mu": "mu"}
 
 
@@ -30,6 +32,8 @@ class _RefusedError(ArmError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion calibrate`."""
     commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT", parser_class=NumberParser)
+    calibrate_tendons.add_parser(commands)
+    calibrate_tension.add_parser(commands)
     sub = commands.add_parser(
         "stiffness",
         help="EI, tendon stiffness, pretension and guide friction from a loading test",
@@ -73,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Fit; exit code 2 with one line on standard error when data or arguments are refused."""
     config = load_from(arguments)
     try:
-        return _stiffness(arguments, config)
+        return _GUIDED.get(arguments.what, _stiffness)(arguments, config)
     except ConfigError:
         raise
     except loading_csv.DataError as error:
