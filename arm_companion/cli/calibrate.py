@@ -1,4 +1,4 @@
-"""`arm-companion calibrate`: fit the model to measurements of the real arm."""
+"""`arm-companion calibrate`: the tendons on the bench, and the model from measurements of the real arm."""
 
 import argparse
 import importlib.util
@@ -12,6 +12,7 @@ from arm_companion.arm import compiled, identification
 from arm_companion.arm.identification import Fit, LoadingTest
 from arm_companion.arm.parameters import Guides
 from arm_companion.arm.rod_model import RodModel
+from arm_companion.cli import calibrate_tendons, calibrate_tension
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.cli.numbers import NumberParser
 from arm_companion.config import Config, load
@@ -30,6 +31,8 @@ class _RefusedError(ArmError):
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion calibrate`; every calibration sets `calibrate`, which does it."""
     commands = parser.add_subparsers(dest="what", required=True, metavar="WHAT", parser_class=NumberParser)
+    calibrate_tendons.add_parser(commands)
+    calibrate_tension.add_parser(commands)
     _add_stiffness(commands)
 
 

@@ -20,7 +20,7 @@ from arm_companion.mission.facts import (
     Severity,
     TensionEstimate,
 )
-from arm_companion.mission.perch import TABLE, TENSE
+from arm_companion.mission.perch import GRIPPED, TABLE, TENSE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Running, State
@@ -225,8 +225,8 @@ def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error
 def _warn(s: Situation, notices: list[Notice]) -> frozenset[str]:
     """Say once per phase what a person must know and no transition tells."""
     warned = s.state.warned
-    for fault in (s.servo_fault, s.tendon_fault):
-        if fault is not None and s.state.phase in TENSE and fault not in warned:
+    for fault, phases in ((s.servo_fault, TENSE), (s.tendon_fault, GRIPPED | {Phase.HOLDING})):
+        if fault is not None and s.state.phase in phases and fault not in warned:
             notices.append(Notice(Severity.CRITICAL, f"{fault}; the arm holds"))
             warned |= {fault}
     return warned

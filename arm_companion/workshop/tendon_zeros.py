@@ -1,0 +1,270 @@
+"""`calibrate tendons` as a procedure: slack off, take up each tendon in turn, then all together, then store."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.tension import LoadCurve
+from arm_companion.drivers.calibration import ServoIdentity
+from arm_companion.errors import ArmError, ModelError
+from arm_companion.workshop.actions import Ask, Engage, Keep, Move, Procedure, Release, Say, Stop, Trace
+from arm_companion.workshop.take_up import Baseline, balanced, baseline, combine, crossing, knee
+
+_FREE_RUN_M = 0.005
+_STROKES = 6
+_LEAD = 10  # samples in which a servo starts or stops
+_CLEAR_M = 0.001
+_LET_OUT_TRIES = 3
+_TIGHT = 1.5  # times the pretension, to which all tendons are taken together
+_LINE_FROM = 0.4  # of the pretension: above it every tendon is taut
+
+
+class Refused(ArmError):
+    """The procedure cannot go on; the message says what to look for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How gently."""
+
+    threshold: float = 3.0  # N, at which a tendon alone counts as taken up
+    slack: float = 0.012  # m, by which all tendons are let out first
+    speed: float = 0.004  # m/s
+    travel: float = 0.06  # m, farthest way to the threshold
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """One tendon alone."""
+
+    knee_ticks: float
+    sigma: float  # m
+    slope: float  # N/m
+    inwards: float  # baseline, share of full load
+    outwards: float
+    noise: float
+    samples: int
+    temperature: float  # degC
+
+    @property
+    def baseline(self) -> Baseline:
+        """Of the slack tendon."""
+        return Baseline(self.inwards, self.outwards, self.noise, self.samples)
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What has been found so far, while the servos keep counting."""
+
+    version: int
+    made_unix_s: float
+    servos: tuple[ServoIdentity, ...]
+    pulley_radius: float  # m
+    found: tuple[Found, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Zero:
+    """The result for one tendon."""
+
+    ticks: int
+    sigma: float  # m
+    friction: float  # N
+    temperature: float  # degC
+
+
+@dataclass(frozen=True, slots=True)
+class Setup:
+    """What the procedure needs to know of the arm."""
+
+    arm: ArmParameters
+    curves: tuple[LoadCurve, ...]
+    directions: tuple[int, ...]
+    ids: tuple[int, ...]
+    m_per_tick: float
+    tension_max: float  # N
+    options: Options = Options()
+
+    @property
+    def n(self) -> int:
+        """Number of tendons."""
+        return len(self.ids)
+
+
+def procedure(setup: Setup, done: tuple[Found, ...] = ()) -> Procedure[tuple[Zero, ...]]:
+    """Find the zeros of all tendons.
+
+    Args:
+        setup: the arm.
+        done: tendons that an interrupted run has found already.
+
+    Returns:
+        The zeros, in the tendons' order.
+
+    Raises:
+        Refused: something is not as it should be.
+    """
+    yield Ask(
+        "The arm must hang straight down by itself, free to bend, the vehicle level and its propellers off.\n"
+        "Torque comes on now; every servo stays where it is."
+    )
+    origin: tuple[int, ...] = yield Engage()
+    slack = -setup.options.slack
+    yield Ask(
+        f"All tendons are let out by {1e3 * setup.options.slack:.0f} mm, so that each can be felt on its own.\n"
+        "Keep an eye on the pulleys: no tendon may jump off."
+    )
+    yield Move((slack,) * setup.n, setup.options.speed * 2.0)
+    found = list(done)
+    for i in range(len(found), setup.n):
+        one, slack = yield from _take_up(setup, i, origin, slack)
+        found.append(one)
+        yield Keep(tuple(found))
+    knees = [setup.directions[i] * (one.knee_ticks - origin[i]) * setup.m_per_tick for i, one in enumerate(found)]
+    zeros, sigmas = yield from _together(setup, found, knees)
+    yield Say("All tendons are let out to where they start to pull, and the torque goes off.")
+    yield Move(tuple(float(z) - setup.arm.T0[i] / setup.arm.k_T[i] for i, z in enumerate(zeros)), setup.options.speed)
+    yield Release()
+    return tuple(
+        Zero(
+            round(origin[i] + setup.directions[i] * float(zeros[i]) / setup.m_per_tick),
+            float(sigmas[i]),
+            setup.curves[i].gain * one.baseline.friction,
+            one.temperature,
+        )
+        for i, one in enumerate(found)
+    )
+
+
+def _take_up(setup: Setup, i: int, origin: Sequence[int], slack: float) -> Procedure[tuple[Found, float]]:
+    """One tendon alone; what was found of it, and how far all tendons are let out now, m."""
+    options, name = setup.options, _name(setup, i)
+    yield Ask(
+        f"Slack of {name} is taken up until it pulls with {options.threshold:g} N. Alone it bends the arm towards it\n"
+        "by some 45 degrees; that tells where it becomes taut. Then it is let out again."
+    )
+    for attempt in range(_LET_OUT_TRIES):
+        one = yield from _in_and_out(setup, i, origin, slack, ask=attempt == 0)
+        at = setup.directions[i] * (one.knee_ticks - origin[i]) * setup.m_per_tick
+        if at > slack + _FREE_RUN_M + _CLEAR_M:
+            yield Say(
+                f"{name} is taut from {1e3 * at:+.2f} mm on, give or take {1e3 * one.sigma:.2f} mm; its gears take "
+                f"{setup.curves[i].gain * one.baseline.friction:.1f} N."
+            )
+            return one, slack
+        slack -= options.slack
+        yield Say(f"{name} was not slack to begin with: all tendons are let out further.")
+        yield Move((slack,) * setup.n, options.speed * 2.0)
+    raise Refused(f"{name} does not become slack: does the arm hang free, and is servos.directions right?")
+
+
+def _in_and_out(setup: Setup, i: int, origin: Sequence[int], slack: float, *, ask: bool) -> Procedure[Found]:
+    """A free run, on to the threshold, and back: the slack servo's own load, and the knee."""
+    options, name = setup.options, _name(setup, i)
+    free: Trace = yield Move(_one(setup, i, slack, slack + _FREE_RUN_M), options.speed)
+    gain = setup.curves[i].gain * _volts(free, i) / setup.curves[i].volts
+    running = free.load(i)[_LEAD:]
+    resting = sum(running) / max(len(running), 1)
+    stop = Stop(i, resting + options.threshold / gain)
+    taken: Trace = yield Move(_one(setup, i, slack, slack + options.travel), options.speed, stop)
+    if not taken.stopped:
+        raise Refused(
+            f"{name} does not pull within {1e3 * options.travel:.0f} mm: is it broken or off its pulley, is its "
+            "direction (servos.directions) wrong, or must it be made shorter by hand?"
+        )
+    if ask and not (
+        yield Ask(f"The arm should be bent towards tendon {i + 1} now. Enter if it is, n if it bends another way.")
+    ):
+        raise Refused(f"{name} pulls elsewhere: check servos.ids, servos.directions and arm.tendons.angles_deg")
+    back: Trace = yield Move((slack,) * setup.n, options.speed)
+    try:
+        base = baseline(running, [s.load[i] for s in back.samples[:-_LEAD] if s.wound[i] < slack + _FREE_RUN_M])
+        wound, force = [], []
+        for samples, level in (
+            (free.samples[_LEAD:], base.inwards),
+            (taken.samples[_LEAD:], base.inwards),
+            (back.samples[_LEAD:-_LEAD], base.outwards),
+        ):
+            wound += [s.wound[i] for s in samples]
+            force += [gain * (s.load[i] - level) for s in samples]
+        bend = knee(wound, force, gain * base.noise)
+    except ModelError as error:
+        raise Refused(f"{name}: {error}") from error
+    return Found(
+        origin[i] + setup.directions[i] * bend.at / setup.m_per_tick,
+        bend.sigma,
+        bend.slope,
+        base.inwards,
+        base.outwards,
+        base.noise,
+        base.samples,
+        back.samples[-1].temperature[i],
+    )
+
+
+def _name(setup: Setup, i: int) -> str:
+    return f"tendon {i + 1} (servo {setup.ids[i]})"
+
+
+def _volts(trace: Trace, i: int) -> float:
+    return max(trace.samples[-1].voltage[i], 1.0)
+
+
+def _one(setup: Setup, i: int, rest: float, wound: float) -> tuple[float, ...]:
+    return tuple(wound if k == i else rest for k in range(setup.n))
+
+
+def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> Procedure[tuple[np.ndarray, np.ndarray]]:
+    """All tendons at once, which holds the arm straight: their common tightness."""
+    arm, options = setup.arm, setup.options
+    tight = tuple(
+        at + min(_TIGHT * float(arm.T0[i]), 0.5 * setup.tension_max) / float(arm.k_T[i]) for i, at in enumerate(knees)
+    )
+    loose = tuple(at - 0.0005 for at in knees)
+    yield Ask(
+        f"All tendons are taken up together, to about {_TIGHT * float(arm.T0.max()):.0f} N and back, "
+        f"{_STROKES} times.\nThe arm stays straight; this tells how tight they are against each other."
+    )
+    yield Move(loose, options.speed)
+    N = balanced(arm.H)
+    x: list[np.ndarray] = []
+    y: list[np.ndarray] = []
+    for _ in range(_STROKES):
+        for goal, inwards in ((tight, True), (loose, False)):
+            trace: Trace = yield Move(goal, options.speed)
+            for sample in trace.samples[_LEAD:-_LEAD]:
+                force = [
+                    setup.curves[i].gain
+                    * (sample.voltage[i] / setup.curves[i].volts)
+                    * (sample.load[i] - (one.inwards if inwards else one.outwards))
+                    for i, one in enumerate(found)
+                ]
+                x.append(np.asarray(sample.wound))
+                y.append(np.asarray(force))
+    return _solve(setup, found, np.asarray(knees), N, np.asarray(x), np.asarray(y))
+
+
+def _solve(
+    setup: Setup, found: Sequence[Found], knees: np.ndarray, N: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Zeros (n,), m, and their sigma, from knees (n,), m, and from lengths x (q, n), m, with tensions y (q, n), N."""
+    arm = setup.arm
+    stretch = arm.T0 / arm.k_T  # from the knee to the pretension, for the arm held straight
+    noise = np.array([curve.gain * one.noise for curve, one in zip(setup.curves, found, strict=True)])
+    taut = x.mean(axis=1) > float(np.mean(knees + _LINE_FROM * stretch))
+    together, spread = [], []
+    try:
+        for column in N.T:
+            sign = 1.0 if float(column.sum()) >= 0.0 else -1.0
+            level = float(sign * column @ arm.T0)
+            at, sigma = crossing(
+                x[taut] @ (sign * column), y[taut] @ (sign * column), level, float(np.linalg.norm(column * noise))
+            )
+            together.append(sign * at)
+            spread.append(sigma)
+    except ModelError as error:
+        raise Refused(f"all tendons together: {error}; is one of them caught?") from error
+    alone_sigma = np.array([one.sigma for one in found])
+    return combine(knees + stretch, alone_sigma, N, np.asarray(together), np.asarray(spread))
