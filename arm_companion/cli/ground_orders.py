@@ -1,0 +1,234 @@
+"""`arm-companion ground` that orders: ready, perch, ... jog and the parameters."""
+
+import argparse
+import asyncio
+import contextlib
+import dataclasses
+import math
+import signal
+import sys
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Final
+
+from arm_companion.cli.ground import DONE, FAILED, INTERRUPTED, USAGE, Action, say, tell
+from arm_companion.clock import ticks
+from arm_companion.errors import ArmError
+from arm_companion.ground.arm import Arm
+from arm_companion.ground.channel import ArmSilent
+from arm_companion.ground.commands import CommandFailed
+from arm_companion.ground.jog import HELP, PERIOD_S, WATCHDOG_S, Jog, keyboard
+from arm_companion.ground.parameters import Parameter
+from arm_companion.ground.reports import Status
+from arm_companion.ground.texts import Text
+
+_TARGET_S: Final = 1.5
+
+
+@contextlib.asynccontextmanager
+async def interrupts() -> "AsyncIterator[asyncio.Queue[int]]":
+    """Each Ctrl-C as an entry of a queue, instead of an exception."""
+    queue: asyncio.Queue[int] = asyncio.Queue()
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGINT, queue.put_nowait, signal.SIGINT)
+    try:
+        yield queue
+    finally:
+        loop.remove_signal_handler(signal.SIGINT)
+
+
+async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Awaitable[None]) -> int:
+    """Follow an order to its end, and say what comes of it.
+
+    Ctrl-C does not touch the arm: it only says how to. The second one aborts, as whoever presses it twice wants the arm
+    to stop and not this program. The third one leaves.
+    """
+    loop = asyncio.get_running_loop()
+    started = loop.time()
+    task = asyncio.ensure_future(work)
+    listener = asyncio.create_task(_repeat_texts(arguments, arm))
+    pressed = 0
+    try:
+        async with interrupts() as queue:
+            while not task.done():
+                press = asyncio.create_task(queue.get())
+                await asyncio.wait({task, press}, return_when=asyncio.FIRST_COMPLETED)
+                if not press.done():
+                    press.cancel()
+                    break
+                pressed += 1
+                if pressed == 1:
+                    say(arguments, f"{name} goes on. Ctrl-C again: abort. A third time: leave, and the arm carries on.")
+                elif pressed == 2:
+                    say(arguments, "aborting")
+                    abort = asyncio.create_task(_abort(arguments, arm))
+                    press_again = asyncio.create_task(queue.get())
+                    await asyncio.wait({abort, press_again}, return_when=asyncio.FIRST_COMPLETED)
+                    if press_again.done():
+                        pressed = 3
+                    for unfinished in (abort, press_again):
+                        unfinished.cancel()
+                if pressed >= 3:
+                    break
+    finally:
+        listener.cancel()
+        if not task.done():
+            task.cancel()
+    seconds = round(loop.time() - started, 3)
+    state = arm.status.state if arm.status else ""
+    if pressed >= 3 or (pressed and task.cancelled()):
+        say(arguments, f"left: the arm carries on ({state}). To abort: arm-companion ground abort")
+        tell(arguments, action=arguments.action, result="left", reason="", state=state, seconds=seconds)
+        return INTERRUPTED
+    try:
+        await task
+    except CommandFailed as failed:
+        print(f"arm-companion ground: {failed}", file=sys.stderr)
+        tell(
+            arguments,
+            action=arguments.action,
+            result=failed.result,
+            reason=failed.reason,
+            state=state,
+            seconds=seconds,
+        )
+        return INTERRUPTED if pressed else FAILED
+    say(arguments, f"{name} done in {seconds:.1f} s" + (f", state {state}" if state else ""))
+    tell(arguments, action=arguments.action, result="accepted", reason="", state=state, seconds=seconds)
+    return DONE
+
+
+async def _abort(arguments: argparse.Namespace, arm: Arm) -> None:
+    try:
+        await arm.abort()
+    except ArmError as error:
+        say(arguments, f"ABORT: {error}")
+
+
+async def _repeat_texts(arguments: argparse.Namespace, arm: Arm) -> None:
+    async for text in arm.stream(Text, patient=True):
+        say(arguments, f"  {text.severity}: {text.text}")
+
+
+def _order(name: str) -> Action:
+    async def action(arguments: argparse.Namespace, arm: Arm) -> int:
+        def progress(per_cent: int | None) -> None:
+            say(arguments, f"  {name.upper()} in progress" + ("" if per_cent is None else f", {per_cent} %"))
+
+        if name == "abort":
+            return await follow(arguments, arm, "ABORT", arm.abort(timeout=arguments.timeout))
+        if name == "perch" and arguments.bar is not None:
+            await _target(arguments, arm)
+        method: Callable[..., Awaitable[None]] = getattr(arm, name)
+        return await follow(arguments, arm, name.upper(), method(progress=progress, timeout=arguments.timeout))
+
+    return action
+
+
+async def _target(arguments: argparse.Namespace, arm: Arm) -> None:
+    """Tell where the bar is, and see it taken.
+
+    Raises:
+        ArmError: it is refused, or nothing shows that it has been taken.
+    """
+    if arguments.bar_axis_deg is None or arguments.bar_radius is None:
+        raise ArmError("--bar needs --bar-axis-deg and --bar-radius")
+    heading = math.radians(arguments.bar_axis_deg)
+    north, east, down = arguments.bar
+    await arm.target_bar((north, east, down), (math.cos(heading), math.sin(heading), 0.0), arguments.bar_radius)
+    said = len(arm.texts)
+
+    def refusal() -> str:
+        return next((t.text for t in list(arm.texts)[said:] if t.text.startswith("target refused")), "")
+
+    def answered() -> bool:
+        return bool(refusal()) or (arm.status is not None and "target_known" in arm.status.flags)
+
+    # A refusal comes at once; the flag may be that of an earlier target, so that a refusal is waited for anyway.
+    with contextlib.suppress(ArmSilent):
+        await arm.channel.wait_for(lambda: bool(refusal()), 0.5, "")
+    await arm.channel.wait_for(answered, _TARGET_S, "the arm does not show that it has taken the bar")
+    if refusal():
+        raise ArmError(refusal())
+
+
+async def _jog(arguments: argparse.Namespace, arm: Arm) -> int:
+    if arguments.vehicle is not None:
+        return await follow(arguments, arm, "JOG", arm.jog_vehicle(*arguments.vehicle))
+    if arguments.theta_deg is not None:
+        theta, delta = math.radians(arguments.theta_deg), math.radians(arguments.delta_deg)
+        return await follow(arguments, arm, "JOG", arm.jog_bend(theta, delta))
+    if not sys.stdin.isatty():
+        print("arm-companion ground: jog from the keyboard needs a terminal; or give --theta-deg", file=sys.stderr)
+        return USAGE
+    status = await arm.first(Status)
+    if status.state != "READY":
+        print(f"arm-companion ground: jogging needs state READY, the arm is in {status.state}", file=sys.stderr)
+        return FAILED
+    return await _jog_by_keys(arguments, arm, status)
+
+
+async def _jog_by_keys(arguments: argparse.Namespace, arm: Arm, status: Status) -> int:
+    jog = Jog(*(value if math.isfinite(value) else 0.0 for value in (status.theta, status.delta)))
+    say(arguments, HELP)
+    listener = asyncio.create_task(_repeat_texts(arguments, arm))
+    try:
+        async with interrupts() as stop, keyboard() as keys:
+            async for _ in ticks(PERIOD_S):
+                now = arm.status or status
+                while not keys.empty():
+                    key = keys.get_nowait()
+                    if key == "q":
+                        stop.put_nowait(signal.SIGINT)
+                    jog = jog.press(key, now.theta, now.delta)
+                if not stop.empty() or now.state not in ("READY", "JOG"):
+                    break
+                await arm.send_set_point(jog.theta, jog.delta, WATCHDOG_S)
+                if arguments.json:
+                    tell(arguments, theta=jog.theta, delta=jog.delta, arm_theta=now.theta, arm_delta=now.delta)
+                else:
+                    asked = f"asked {math.degrees(jog.theta):6.1f} deg in {math.degrees(jog.delta):6.1f}"
+                    is_at = f"at {math.degrees(now.theta):6.1f} in {math.degrees(now.delta):6.1f}"
+                    print(f"\r{asked}   {is_at}   step {math.degrees(jog.step_rad):.1f} ", end="", flush=True)
+    finally:
+        listener.cancel()
+    state = arm.status.state if arm.status else "unknown"
+    say(arguments, f"\njogging ended: the arm holds where it was asked to be, state {state}")
+    return DONE
+
+
+async def _params(arguments: argparse.Namespace, arm: Arm) -> int:
+    if (arguments.name is None) != (arguments.verb == "list") or (arguments.value is None) == (arguments.verb == "set"):
+        print("arm-companion ground: params list | params get NAME | params set NAME VALUE", file=sys.stderr)
+        return USAGE
+    if arguments.verb == "list":
+        found = await arm.parameters.read_all()
+        tell(arguments, parameters=[_plain(p) for p in found])
+        for parameter in () if arguments.json else found:
+            print(_line(parameter))
+        return DONE
+    if arguments.verb == "get":
+        parameter = await arm.parameters.read(arguments.name)
+    else:
+        parameter = await arm.parameters.write(arguments.name, arguments.value)
+    if arguments.json:
+        tell(arguments, **_plain(parameter))
+    else:
+        print(_line(parameter))
+    return DONE
+
+
+def _plain(parameter: Parameter) -> dict[str, object]:
+    fields = dataclasses.asdict(parameter)
+    return {**fields, "value": parameter.value if math.isfinite(parameter.value) else None}
+
+
+def _line(parameter: Parameter) -> str:
+    value = f"{parameter.value:.9g}" if math.isfinite(parameter.value) else "?"
+    return f"{parameter.name:<16}  {value:>14}  {parameter.kind}"
+
+
+ACTIONS: Final[dict[str, Action]] = {
+    **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort")},
+    "jog": _jog,
+    "params": _params,
+}
