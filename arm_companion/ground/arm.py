@@ -12,7 +12,6 @@ from arm_companion.ground.channel import SILENT_S, Address, ArmSilent, Channel
 from arm_companion.ground.commands import Commander, Progress
 from arm_companion.ground.parameters import ParameterClient
 from arm_companion.ground.reports import REPORTS, Report, Status, Tendons, Vector, Wrench
-from arm_companion.ground.station import Station
 from arm_companion.ground.texts import Sentences, Text
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
@@ -83,6 +82,8 @@ class Arm:
             LinkError: the URL cannot be opened.
             ArmSilent: no heartbeat of the component in time. Nothing has been sent to it.
         """
+        from arm_companion.ground.station import Station  # noqa: PLC0415 - only a connection needs MAVSDK
+
         channels: list[Channel] = []
 
         def deliver(message: Message) -> None:
