@@ -26,8 +26,7 @@ from arm_companion.mission.state import MOVES_VEHICLE, State
 from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
-from arm_companion.transport.serial import open_serial
-from arm_companion.transport.urls import open_url
+from arm_companion.transport.urls import open_bus, open_url
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +52,11 @@ def open_configured(config: Config) -> Openers:
     """The real transports that a configuration names.
 
     Raises:
-        ConfigError: a link's URL cannot be read.
+        ConfigError: the URL of a link or of the servo bus cannot be read.
     """
     return Openers(
         {name: open_url(link.url) for name, link in config.links.items()},
-        open_serial(config.servos.port, config.servos.baud),
+        open_bus(config.servos.port, config.servos.baud),
     )
 
 

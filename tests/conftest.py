@@ -5,6 +5,7 @@ import pytest
 
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec, Message
+from arm_companion.protocol.tunnel import unwrap
 from arm_companion.transport.base import Transport
 from arm_companion.transport.memory import MemoryPipe
 
@@ -13,10 +14,11 @@ hypothesis.settings.load_profile("shared machine")
 
 
 class MavlinkPeer:
-    """A system that keeps every message it receives."""
+    """A system that keeps every message it receives, those inside TUNNEL too."""
 
     def __init__(self, system: int, component: int) -> None:
         self.codec = MavlinkCodec(system, component)
+        self.inner = MavlinkCodec(system, component)
         self.received: list[Message] = []
         self.pipe = MemoryPipe()
         self.transport: Transport | None = None
@@ -26,7 +28,11 @@ class MavlinkPeer:
         self.transport = await self.pipe.opener(1)(self.receive)
 
     def receive(self, data: bytes) -> None:
-        self.received += self.codec.feed(data)
+        for message in self.codec.feed(data):
+            self.received.append(message)
+            if message.get_type() == "TUNNEL":
+                frame = unwrap(message.payload_type, bytes(message.payload))
+                self.received += [] if frame is None else self.inner.feed(frame)
 
     def send(self, *messages: Message) -> None:
         assert self.transport is not None

@@ -70,6 +70,11 @@ def option(
     return field(default=default, metadata=metadata)
 
 
+def options(doc: str, *, unit: str = "", lower: float = 0.0, upper: float = math.inf) -> Any:
+    """A dataclass field that holds a table of numbers by name, all with the same bounds; empty by default."""
+    return field(default_factory=dict, metadata={_META: Option(doc, unit, lower, upper)})
+
+
 def section(cls: type[T]) -> T:
     """A nested section whose own defaults apply when the table is absent."""
     return field(default_factory=cls)

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from arm_companion.config.options import option, section
+from arm_companion.config.options import option, options, section
 from arm_companion.errors import ConfigError
 
 
@@ -117,19 +117,104 @@ class VehicleConfig:
     )
 
 
+STREAMED = (
+    "ARM_STATUS",
+    "ARM_TENDONS",
+    "ARM_REACTION_WRENCH",
+    "ARM_STIFFNESS",
+    "ARM_PAYLOAD",
+    "NAMED_VALUE_FLOAT",
+    "DEBUG_FLOAT_ARRAY",
+    "LINK_NODE_STATUS",
+)
+"""Messages with a rate of their own on each link."""
+
+
 @dataclass(frozen=True)
 class LinkConfig:
     """[links.NAME] One MAVLink connection."""
 
-    url: str = option("udpin:HOST:PORT, udpout:HOST:PORT or serial:DEVICE:BAUD")
-    role: str = option("who is at the other end", "ground", choices=("autopilot", "ground"))
+    url: str = option(
+        "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
+    )
+    role: str = option(
+        "who is at the other end; a peer is a component on board, such as a vision process",
+        "ground",
+        choices=("autopilot", "ground", "peer"),
+    )
+    rates_hz: Mapping[str, float] = options("rate of a message on this link, instead of [rates]'s", upper=200.0)
+    pace_s: float = option(
+        "least time between frames; 0 is 0.005 to a PX4 autopilot and none elsewhere",
+        0.0,
+        unit="s",
+        lower=0.0,
+        upper=0.5,
+    )
+    bandwidth_bytes_per_s: float = option(
+        "most that is sent, set-points aside; 0 is what a serial line's speed allows, else no limit",
+        0.0,
+        unit="B/s",
+        lower=0.0,
+        upper=1e8,
+    )
+    tunnel: str = option(
+        "our own messages inside TUNNEL; auto: towards the autopilot, which forwards them in no other way",
+        "auto",
+        choices=("auto", "on", "off"),
+    )
+    mirrors: str = option(
+        "the essentials as NAMED_VALUE_FLOAT and DEBUG_FLOAT_ARRAY too; auto: towards the autopilot",
+        "auto",
+        choices=("auto", "on", "off"),
+    )
+    forward: bool = option("whether frames pass between this link and the others that have this set", default=False)
+    signing_key: str = option("file with the 32 bytes of the signing key, mode 0600; empty: nothing is signed", "")
+    unsigned: str = option(
+        "with a signing key, unsigned frames are dropped (refuse), may tell but not ask for anything (listen), or "
+        "count like signed ones (accept)",
+        "refuse",
+        choices=("refuse", "listen", "accept"),
+    )
+
+    def __post_init__(self) -> None:
+        for name in self.rates_hz:
+            if name not in STREAMED:
+                raise ConfigError(f"rates_hz names {name}, which is none of {', '.join(STREAMED)}")
+
+
+@dataclass(frozen=True)
+class MavlinkConfig:
+    """[mavlink] Our component: who may ask it for what, and what it keeps."""
+
+    state_directory: str = option(
+        "where parameters and signing time stamps are kept; empty: where systemd says, else nowhere", ""
+    )
+    mission_commands: bool = option("whether items of the autopilot's mission may command the arm", default=True)
+    grab: str = option("what DO_GRIPPER's grab means", "perch", choices=("perch", "grasp"))
+    actuator: int = option(
+        "value of DO_SET_ACTUATOR, 1 to 6, that bends the arm: 1.0 is limits.bend_max_rad; 0: none", 0, lower=0, upper=6
+    )
+    control_timeout_s: float = option(
+        "a ground station loses primary control when silent for", 10.0, unit="s", lower=2.0, upper=600.0
+    )
+    target_age_s: float = option(
+        "ARM_TARGET and ARM_SETPOINT with a stamp older than this are refused", 2.0, unit="s", lower=0.05, upper=60.0
+    )
+    check_vehicle: bool = option("whether the autopilot's settings are looked at after start and reboot", default=True)
+    vehicle_instance: int = option(
+        "n in the MAV_n_* parameters (MAVn_* on ArduPilot) of the autopilot's port to this computer; "
+        "-1 is 1 on PX4 (TELEM2) and 2 on ArduPilot (SERIAL2)",
+        -1,
+        lower=-1,
+        upper=9,
+    )
 
 
 @dataclass(frozen=True)
 class ServosConfig:
     """[servos] The Dynamixel bus and what each servo pulls."""
 
-    port: str = option("serial device of the bus", "/dev/ttyUSB0")
+    port: str = option("serial device of the bus, or tcp:HOST:PORT of a bridge to it", "/dev/ttyUSB0")
     baud: int = option("bits per second", 1_000_000, lower=9600, upper=4_500_000)
     ids: tuple[int, ...] = option("servo id of each tendon, in the tendons' order", (1, 2, 3, 4), lower=0, upper=252)
     directions: tuple[int, ...] = option(
@@ -251,6 +336,9 @@ class RatesConfig:
     status_hz: float = option("ARM_STATUS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     tendons_hz: float = option("ARM_TENDONS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     wrench_hz: float = option("ARM_REACTION_WRENCH", 20.0, unit="Hz", lower=0.0, upper=200.0)
+    stiffness_hz: float = option("ARM_STIFFNESS", 0.0, unit="Hz", lower=0.0, upper=20.0)
+    payload_hz: float = option("ARM_PAYLOAD, while one is estimated", 1.0, unit="Hz", lower=0.0, upper=50.0)
+    mirrors_hz: float = option("NAMED_VALUE_FLOAT and DEBUG_FLOAT_ARRAY", 1.0, unit="Hz", lower=0.0, upper=20.0)
 
 
 @dataclass(frozen=True)
@@ -290,6 +378,7 @@ class Config:
     mount: MountConfig = section(MountConfig)
     vehicle: VehicleConfig = section(VehicleConfig)
     links: Mapping[str, LinkConfig] = field(default_factory=dict)
+    mavlink: MavlinkConfig = section(MavlinkConfig)
     servos: ServosConfig = section(ServosConfig)
     limits: LimitsConfig = section(LimitsConfig)
     perch: PerchConfig = section(PerchConfig)

@@ -1,7 +1,11 @@
 """One MAVLink connection: keeps it open, hands messages on, and paces what goes out.
 
 A PX4 autopilot drops frames that come in bursts: of 100 back to back 5 arrive, of 100 sent 5 ms apart all do. So
-everything but set-points waits its turn there, and where too much waits the oldest is dropped.
+everything but set-points waits its turn there, and where too much waits the oldest is dropped. Set-points are for
+the autopilot itself and do not pass through the buffer that overflows.
+
+No autopilot forwards our private messages. Where they have to pass one they travel inside TUNNEL, and what comes
+that way is read as if it had come directly.
 """
 
 import asyncio
@@ -13,10 +17,13 @@ from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from typing import Final
 
-from arm_companion.config.schema import VehicleConfig
+from arm_companion.config.schema import LinkConfig, VehicleConfig
 from arm_companion.drivers.streams import Streams
 from arm_companion.errors import LinkError, ProtocolError
-from arm_companion.protocol.mavlink import MavlinkCodec, Message
+from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.mavlink import SIGNED, Header, MavlinkCodec, Message, Tap
+from arm_companion.protocol.signing import Signing
+from arm_companion.protocol.tunnel import tunnel, unwrap
 from arm_companion.transport.base import Opener, Transport
 
 log = logging.getLogger(__name__)
@@ -29,6 +36,12 @@ SILENCE_S: Final = 0.05
 
 UNKNOWN_SYSTEM: Final = 1
 """Our system id until the autopilot's is known; the factory setting of both flight stacks."""
+
+OURS: Final = range(64_000, 64_100)
+"""Ids of our own messages: the ones that TUNNEL is for."""
+
+_TUNNEL: Final = mav.MAVLINK_MSG_ID_TUNNEL
+_BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bit
 
 _FIRST_DELAY_S: Final = 0.2
 _LONGEST_DELAY_S: Final = 5.0
@@ -56,6 +69,11 @@ class LinkCounters:
     unsent: int = 0  # messages for a link that was not open, or not yet identified
     crowded_out: int = 0  # messages dropped from a full queue
     handler_errors: int = 0
+    received_bytes: int = 0
+    sent_bytes: int = 0
+    tunnelled: int = 0  # frames of ours that came inside TUNNEL
+    bad_tunnels: int = 0  # TUNNELs of our type whose content is not what it should be
+    forwarded: int = 0  # frames of others that left here
 
 
 class MavlinkLink:
@@ -63,9 +81,10 @@ class MavlinkLink:
 
     Args:
         name: its name in the configuration, for logs.
-        role: who is at the other end: "autopilot" or "ground".
+        role: who is at the other end: "autopilot", "ground" or "peer".
         opener: opens its transport.
         vehicle: our ids, and the flight stack, which decides the pacing.
+        config: its section of the configuration; without one the defaults of the role.
         jitter: numbers from 0 to 1 that spread the attempts to reconnect. By default a sequence of the
             link's own, the same in each run.
     """
@@ -77,23 +96,35 @@ class MavlinkLink:
         opener: Opener,
         vehicle: VehicleConfig,
         *,
+        config: LinkConfig | None = None,
         jitter: Callable[[], float] | None = None,
     ) -> None:
         self.name = name
         self.role = role
+        self.config = LinkConfig("", role) if config is None else config
         self.counters = LinkCounters()
         self.streams = Streams()
         """What is sent on this link periodically."""
         self._opener = opener
-        self._codec = MavlinkCodec(vehicle.system_id or UNKNOWN_SYSTEM, vehicle.component_id, wanted=())
+        system = vehicle.system_id or UNKNOWN_SYSTEM
+        self._codec = MavlinkCodec(system, vehicle.component_id, wanted=(_TUNNEL,))
+        # What is inside of TUNNEL has sequence numbers of its own, so that losses can be told on both levels.
+        self._inner = MavlinkCodec(system, vehicle.component_id, wanted=())
         self._identified = role != "autopilot" or vehicle.system_id != 0
-        self._pace_s = PX4_PACE_S if role == "autopilot" and vehicle.autopilot == "px4" else 0.0
+        to_px4 = role == "autopilot" and vehicle.autopilot == "px4"
+        self._pace_s = self.config.pace_s or (PX4_PACE_S if to_px4 else 0.0)
+        self._bandwidth = _bandwidth(self.config)
+        self.tunnels = _decide(self.config.tunnel, auto=role == "autopilot")
+        """Whether our own messages leave inside TUNNEL."""
+        self.mirrors = _decide(self.config.mirrors, auto=role == "autopilot")
+        """Whether the essentials leave as messages that everybody knows, too."""
+        self._signing: Signing | None = None
         self._jitter = jitter or random.Random(name).random  # noqa: S311 - spreads retries, guards nothing
         self._handlers: dict[int | None, list[MessageHandler]] = {}
         self._open_handlers: list[OpenHandler] = []
         self._transport: Transport | None = None
-        self._queues: dict[int, deque[Message]] = {p: deque() for p in _QUEUE_LENGTHS}
-        self._last_write = float("-inf")
+        self._queues: dict[int, deque[Message | bytes]] = {p: deque() for p in _QUEUE_LENGTHS}
+        self._ready_at = float("-inf")  # loop time from which the next frame of a queue may leave
         self._drain_timer: asyncio.TimerHandle | None = None
         self._silence_timer: asyncio.TimerHandle | None = None
         self._heard = False
@@ -110,7 +141,7 @@ class MavlinkLink:
 
     @system_id.setter
     def system_id(self, value: int) -> None:
-        self._codec.system_id = value
+        self._codec.system_id = self._inner.system_id = value
         self._identified = True
 
     @property
@@ -123,12 +154,58 @@ class MavlinkLink:
         """Whether the transport is open (not: whether anybody listens)."""
         return self._transport is not None
 
+    @property
+    def waiting(self) -> int:
+        """Messages that wait for their turn."""
+        return sum(map(len, self._queues.values()))
+
+    @property
+    def dropped(self) -> int:
+        """Chunks that the open transport could not get rid of."""
+        return 0 if self._transport is None else self._transport.dropped
+
+    # --- who may speak here ---
+
+    def secure(self, signing: Signing, unix: Callable[[], float]) -> None:
+        """Sign what leaves, and let in what is signed; the configuration says what becomes of the rest.
+
+        Args:
+            signing: key and time stamps.
+            unix: Unix time now, s.
+        """
+        self._signing = signing
+
+        def let_in(frame: bytes, head: Header) -> bool:
+            if head.flags & SIGNED:
+                return signing.accept(frame, head, unix())
+            # a telemetry radio reports itself and has no key
+            return self.config.unsigned != "refuse" or head.id == mav.MAVLINK_MSG_ID_RADIO_STATUS
+
+        self._codec.guard = let_in
+        self._codec.seal = lambda frame: signing.sign(frame, unix())
+
+    @property
+    def signing(self) -> Signing | None:
+        """Key and time stamps; None where nothing is signed."""
+        return self._signing
+
+    def trusts(self, message: Message) -> bool:
+        """Whether the message's sender may ask for something: it is signed, or need not be."""
+        return self._signing is None or self.config.unsigned == "accept" or bool(message.get_signed())
+
+    # --- in and out ---
+
+    def listen_in(self, tap: Tap) -> None:
+        """Give every good frame that comes in to `tap`, whoever it is for."""
+        self._codec.tap = tap
+
     def subscribe(self, handler: MessageHandler, ids: Collection[int] | None = None) -> None:
         """Call `handler(message, link)` for each message with one of `ids`; None is every known message."""
         for id_ in (None,) if ids is None else ids:
             self._handlers.setdefault(id_, []).append(handler)
         wanted = self._codec.wanted
         self._codec.wanted = None if ids is None or wanted is None else wanted | frozenset(ids)
+        self._inner.wanted = frozenset(OURS) if self._codec.wanted is None else self._codec.wanted & frozenset(OURS)
 
     def subscribe_open(self, handler: OpenHandler) -> None:
         """Call `handler(link)` each time that the transport has been opened."""
@@ -140,16 +217,24 @@ class MavlinkLink:
         Raises:
             ProtocolError: a field does not fit its type (only where it is sent at once; else it is logged).
         """
+        self._submit(message, priority)
+
+    def pass_on(self, frame: bytes) -> None:
+        """Send somebody else's frame as it is, when nothing of ours waits."""
+        self.counters.forwarded += 1
+        self._submit(frame, Priority.BULK)
+
+    def _submit(self, item: Message | bytes, priority: Priority) -> None:
         if self._transport is None or not self._identified:
             self.counters.unsent += 1
-        elif priority is Priority.NOW or not self._pace_s:
-            self._write(message)
+        elif priority is Priority.NOW or not (self._pace_s or self._bandwidth):
+            self._write(item)
         else:
             queue = self._queues[priority]
             if len(queue) >= _QUEUE_LENGTHS[priority]:
                 queue.popleft()
                 self.counters.crowded_out += 1
-            queue.append(message)
+            queue.append(item)
             if self._drain_timer is None:
                 self._drain()
 
@@ -210,6 +295,7 @@ class MavlinkLink:
 
     def _receive(self, data: bytes) -> None:
         self._heard = True
+        self.counters.received_bytes += len(data)
         if self._silence_timer is not None:
             self._silence_timer.cancel()
             self._silence_timer = None
@@ -223,31 +309,74 @@ class MavlinkLink:
 
     def _dispatch(self, messages: Iterable[Message]) -> None:
         for message in messages:
-            for handler in (*self._handlers.get(message.get_msgId(), ()), *self._handlers.get(None, ())):
-                try:
-                    handler(message, self)
-                except Exception:  # one reader's bug must not silence the others
-                    self.counters.handler_errors += 1
-                    log.exception("link %s: handler of %s failed", self.name, message.get_type())
+            self._hand_out(message)
+            if message.get_msgId() == _TUNNEL:
+                self._take_out(message)
 
-    def _write(self, message: Message) -> None:
-        data = self._codec.encode(message)
-        self._last_write = asyncio.get_running_loop().time()
+    def _hand_out(self, message: Message) -> None:
+        for handler in (*self._handlers.get(message.get_msgId(), ()), *self._handlers.get(None, ())):
+            try:
+                handler(message, self)
+            except Exception:  # one reader's bug must not silence the others
+                self.counters.handler_errors += 1
+                log.exception("link %s: handler of %s failed", self.name, message.get_type())
+
+    def _take_out(self, carrier: Message) -> None:
+        """Hand out what a TUNNEL for us carries. Its sender must be the carrier's: nobody speaks for another."""
+        if carrier.target_system not in (0, self.system_id) or carrier.target_component not in (0, self.component_id):
+            return
+        frame = unwrap(carrier.payload_type, bytes(carrier.payload[: carrier.payload_length]))
+        if frame is None:
+            return
+        self._inner.reset()
+        for message in self._inner.feed(frame):
+            if (message.get_srcSystem(), message.get_srcComponent()) == (
+                carrier.get_srcSystem(),
+                carrier.get_srcComponent(),
+            ):
+                message._signed = carrier.get_signed()  # noqa: SLF001 - the carrier's signature covers what it carries
+                self.counters.tunnelled += 1
+                self._hand_out(message)
+            else:
+                self.counters.bad_tunnels += 1
+        self.counters.bad_tunnels += self._inner.pending
+
+    def _encode(self, message: Message) -> bytes:
+        if self.tunnels and message.get_msgId() in OURS:
+            message = tunnel(self._inner.encode(message), 0, 0)
+        return self._codec.encode(message)
+
+    def _write(self, item: Message | bytes) -> None:
+        data = item if isinstance(item, bytes) else self._encode(item)
+        self.counters.sent_bytes += len(data)
+        if self._bandwidth:
+            now = asyncio.get_running_loop().time()
+            self._ready_at = max(self._ready_at, now) + len(data) / self._bandwidth
         if self._transport is not None:
             self._transport.write(data)
 
     def _drain(self) -> None:
-        """Send the most urgent message that waits, if the last frame is old enough, and come again."""
+        """Send the most urgent message that waits, if the line is free, and come again."""
         self._drain_timer = None
         queue = next((q for q in self._queues.values() if q), None)
         if queue is None:
             return
         loop = asyncio.get_running_loop()
-        wait = self._last_write + self._pace_s - loop.time()
-        if wait <= 0.0:
+        if loop.time() >= self._ready_at:
             try:
                 self._write(queue.popleft())
             except ProtocolError:
                 log.exception("link %s: message dropped", self.name)
-            wait = self._pace_s
-        self._drain_timer = loop.call_later(wait, self._drain)
+            self._ready_at = max(self._ready_at, loop.time() + self._pace_s)
+        self._drain_timer = loop.call_at(self._ready_at, self._drain)
+
+
+def _decide(choice: str, *, auto: bool) -> bool:
+    return auto if choice == "auto" else choice == "on"
+
+
+def _bandwidth(config: LinkConfig) -> float:
+    """Bytes per second that the link takes; 0: as many as come."""
+    if config.bandwidth_bytes_per_s or not config.url.startswith("serial:"):
+        return config.bandwidth_bytes_per_s
+    return int(config.url.rpartition(":")[2]) / _BITS_PER_BYTE

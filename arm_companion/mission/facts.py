@@ -35,6 +35,7 @@ class VehicleState:
     heartbeat_age_s: float = float("inf")
     position_age_s: float = float("inf")
     attitude_age_s: float = float("inf")
+    clock_error_s: float = float("inf")  # greatest error of the ages, by TIMESYNC; inf: they count from the arrival
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,6 +122,38 @@ class Bar:
     point_w: Vec3
     axis_w: Vec3
     radius: float
+    covariance_w: tuple[float, ...] | None = None  # m^2, of the point: xx, xy, xz, yy, yz, zz; None: not told
+    direction_sigma: float | None = None  # rad, one sigma of the axis' direction; None: not told
+
+
+@dataclass(frozen=True, slots=True)
+class GraspTarget:
+    """An object in the world: where its grasp frame is, and how wide to wrap."""
+
+    position_w: Vec3
+    attitude_wo: Quaternion | None  # turns object into world axes; None: not told
+    radius: float
+    covariance_w: tuple[float, ...] | None = None  # as a Bar's
+    direction_sigma: float | None = None  # rad, one sigma of the attitude; None: not told
+
+
+class SetpointKind(enum.IntEnum):
+    """What an ArmSetpoint asks for, ARM_SETPOINT_KIND."""
+
+    BEND = 0
+    TIP = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSetpoint:
+    """Where a person or program streams the arm to; there is none any more once its time-out has passed."""
+
+    kind: SetpointKind
+    theta: float  # rad; BEND alone
+    delta: float  # rad; BEND alone
+    tip_a: Vec3  # m, base axes; TIP alone
+    age_s: float
+    timeout_s: float
 
 
 class ArmAction(enum.Enum):
@@ -219,6 +252,24 @@ class StatusReport:
 
 
 @dataclass(frozen=True, slots=True)
+class StiffnessReport:
+    """Tip compliance of the arm in its present pose: twist [linear; angular] per wrench [force; torque], body axes."""
+
+    compliance_b: tuple[float, ...]  # upper triangle of the symmetric 6x6 matrix, row by row
+
+
+@dataclass(frozen=True, slots=True)
+class PayloadReport:
+    """Estimate of what the arm carries."""
+
+    mass: float  # kg
+    mass_sigma: float  # kg
+    centre_of_mass_b: Vec3  # m, body axes
+    centre_of_mass_sigma: Vec3  # m
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Facts:
     """Everything that one step sees: the world as known at this cycle, with the age of each part."""
 
@@ -226,6 +277,11 @@ class Facts:
     tendons: tuple[TendonState, ...]
     requests: tuple[Request, ...] = ()
     bar: Bar | None = None  # newest target
+    bar_age_s: float = float("inf")
+    grasp_target: GraspTarget | None = None  # newest target of that kind
+    grasp_target_age_s: float = float("inf")
+    arm_setpoint: ArmSetpoint | None = None  # newest that has not timed out
+    ground_age_s: float = float("inf")  # since the newest heartbeat of a station that may command
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,3 +295,5 @@ class Commands:
     notices: tuple[Notice, ...]
     status: StatusReport
     wrench: WrenchReport
+    stiffness: StiffnessReport | None = None
+    payload: PayloadReport | None = None

@@ -54,7 +54,14 @@ class Counters:
     unknown: int = 0  # frames with ids that the dialect lacks
     garbage: int = 0  # bytes outside of any frame
     lost: int = 0  # frames missing from the senders' sequences
+    refused: int = 0  # good frames that the guard did not let in
     sent: int = 0  # frames encoded
+
+
+_SIZES: Final = {
+    "char": 1, "uint8_t": 1, "int8_t": 1, "uint16_t": 2, "int16_t": 2, "uint32_t": 4, "int32_t": 4, "float": 4,
+    "uint64_t": 8, "int64_t": 8, "double": 8,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +73,7 @@ class _Layout:
     size: int  # bytes of the whole payload
     unpack: Callable[[bytes], tuple[Any, ...]]
     slots: tuple[tuple[int, int], ...]  # per constructor argument: index in the unpacked tuple, entries (0: scalar)
+    target: tuple[int, int]  # where target_system and target_component stand in the payload; -1: nowhere
 
 
 def _layout(cls: Any) -> _Layout:
@@ -75,7 +83,19 @@ def _layout(cls: Any) -> _Layout:
         starts.append(at)
         at += length
     slots = tuple((starts[order], cls.array_lengths[order] if cls.lengths[order] > 1 else 0) for order in cls.orders)
-    return _Layout(cls, bytes([cls.crc_extra]), cls.unpacker.size, cls.unpacker.unpack, slots)
+    target = (_place(cls, "target_system"), _place(cls, "target_component"))
+    return _Layout(cls, bytes([cls.crc_extra]), cls.unpacker.size, cls.unpacker.unpack, slots, target)
+
+
+def _place(cls: Any, name: str) -> int:
+    """Offset of a field in the payload; -1 when the message has none of that name."""
+    at = 0
+    for field_name, entries in zip(cls.ordered_fieldnames, cls.array_lengths, strict=True):
+        if field_name == name:
+            return at
+        kind = cls.fieldtypes[cls.fieldnames.index(field_name)]
+        at += _SIZES[kind] * max(entries, 1)
+    return -1
 
 
 _LAYOUTS: Final[dict[int, _Layout]] = {id_: _layout(cls) for id_, cls in mav.mavlink_map.items()}
@@ -110,6 +130,12 @@ class MavlinkCodec:
     def __init__(self, system_id: int, component_id: int, wanted: Collection[int] | None = None) -> None:
         self.counters = Counters()
         self.wanted: frozenset[int] | None = None if wanted is None else frozenset(wanted)
+        self.guard: Guard | None = None
+        """Decides which of the good frames are let in; None lets all in."""
+        self.tap: Tap | None = None
+        """Gets every frame that is let in, wanted or not."""
+        self.seal: Callable[[bytes], bytes] | None = None
+        """Turns each frame that leaves into a signed one."""
         self._sender = _Sender(system_id, component_id)
         self._rest = b""
         self._sequences: dict[int, int] = {}
@@ -138,6 +164,8 @@ class MavlinkCodec:
             data: bytes = message.pack(self._sender)
         except (struct.error, TypeError, ValueError, OverflowError) as error:
             raise ProtocolError(f"{message.get_type()} cannot be encoded: {error}") from error
+        if self.seal is not None:
+            data = self.seal(data)
         self._sender.seq = (self._sender.seq + 1) & 0xFF
         self.counters.sent += 1
         return data
@@ -180,7 +208,7 @@ class MavlinkCodec:
                 head = _header(data, at)
                 if self._genuine(data, end, head):
                     at = end
-                    if (self.wanted is None or head.id in self.wanted) and head.id in _LAYOUTS:
+                    if self._let_in(data, end, head) and (self.wanted is None or head.id in self.wanted):
                         messages += self._build(data, end, head)
                     continue
             elif not final:
@@ -190,7 +218,16 @@ class MavlinkCodec:
             at += 1
         return messages
 
-    def _genuine(self, data: bytes, end: int, head: "_Header") -> bool:
+    def _let_in(self, data: bytes, end: int, head: "Header") -> bool:
+        """Show the frame to guard and tap; whether it may be read."""
+        if self.guard is not None and not self.guard(data[head.magic : end], head):
+            self.counters.refused += 1
+            return False
+        if self.tap is not None:
+            self.tap(data[head.magic : end], head)
+        return head.id in _LAYOUTS
+
+    def _genuine(self, data: bytes, end: int, head: "Header") -> bool:
         """Whether the candidate with this header, which ends before `end`, is a frame and not noise."""
         counters = self.counters
         if head.flags & ~SIGNED:  # the standard: drop frames with flags that we do not understand
@@ -211,7 +248,7 @@ class MavlinkCodec:
         self._count_losses(head.system << 8 | head.component, head.sequence)
         return True
 
-    def _build(self, data: bytes, end: int, head: "_Header") -> list[Message]:
+    def _build(self, data: bytes, end: int, head: "Header") -> list[Message]:
         """The message in a genuine frame; none, and counted, when its content cannot be read."""
         try:
             message = _decode(_LAYOUTS[head.id], data[head.payload : head.crc])
@@ -224,6 +261,7 @@ class MavlinkCodec:
             head.id, head.flags, 0, head.crc - head.payload, head.sequence, head.system, head.component
         )
         message._msgbuf = data[head.magic : end]  # noqa: SLF001
+        message._signed = bool(head.flags & SIGNED)  # noqa: SLF001 - where there is no guard it only says: claims to be
         return [message]
 
     def _count_losses(self, sender: int, sequence: int) -> None:
@@ -253,7 +291,9 @@ def _frame_end(data: bytes, at: int) -> int:
     return end + SIGNATURE_LENGTH if header == 10 and data[at + 2] & SIGNED else end
 
 
-class _Header(NamedTuple):
+class Header(NamedTuple):
+    """What a frame says of itself, and where its parts stand in the data that it came in."""
+
     flags: int
     sequence: int
     system: int
@@ -265,15 +305,52 @@ class _Header(NamedTuple):
     crc: int
 
 
-def _header(data: bytes, at: int) -> _Header:
+def _header(data: bytes, at: int) -> Header:
     if data[at] == MAGIC_V2:
         length, flags, sequence, system, component, low, high = _HEADER_V2.unpack_from(data, at)
-        return _Header(flags, sequence, system, component, low | high << 16, at, at + 10, at + 10 + length)
+        return Header(flags, sequence, system, component, low | high << 16, at, at + 10, at + 10 + length)
     length, sequence, system, component, id_ = _HEADER_V1.unpack_from(data, at)
-    return _Header(0, sequence, system, component, id_, at, at + 6, at + 6 + length)
+    return Header(0, sequence, system, component, id_, at, at + 6, at + 6 + length)
 
 
-def _checksum_fits(data: bytes, head: _Header, layout: _Layout) -> bool:
+Guard: TypeAlias = Callable[[bytes, Header], bool]
+Tap: TypeAlias = Callable[[bytes, Header], None]
+
+
+def addressee(frame: bytes, head: Header) -> tuple[int, int]:
+    """System and component that a frame is for; 0 is everybody, also where the message has no address.
+
+    Args:
+        frame: the whole frame.
+        head: its header, with positions in the data that the frame was cut from.
+    """
+    layout = _LAYOUTS.get(head.id)
+    if layout is None:
+        return 0, 0
+    start, length = head.payload - head.magic, head.crc - head.payload
+    system, component = (
+        frame[start + place] if 0 <= place < length else 0 for place in layout.target
+    )  # MAVLink 2 cuts trailing zeros
+    return system, component
+
+
+def crc_extra(message_id: int) -> int | None:
+    """CRC_EXTRA of a message; None for one that the dialect lacks."""
+    layout = _LAYOUTS.get(message_id)
+    return None if layout is None else layout.extra[0]
+
+
+def checksum(frame: bytes, extra: int) -> int:
+    """CRC of a frame from behind its magic to the end of its payload, with CRC_EXTRA.
+
+    Args:
+        frame: magic, header and payload, without checksum.
+        extra: CRC_EXTRA of its message.
+    """
+    return _crc(bytes((extra,)), _crc(frame[1:], _CRC_INIT))
+
+
+def _checksum_fits(data: bytes, head: Header, layout: _Layout) -> bool:
     end = head.crc
     return _crc(layout.extra, _crc(data[head.magic + 1 : end], _CRC_INIT)) == data[end] | data[end + 1] << 8
 

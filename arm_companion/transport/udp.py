@@ -1,4 +1,4 @@
-"""UDP sockets as byte pipes: one that calls out, and one that waits and answers whoever spoke last."""
+"""UDP sockets as byte pipes: one that calls out, one that waits and answers who speaks to it, one that broadcasts."""
 
 import asyncio
 from typing import Any, cast
@@ -8,23 +8,31 @@ from arm_companion.transport.base import Opener, Receiver
 
 Address = tuple[Any, ...]
 
+MOST_PEERS = 8
+"""A waiting socket answers so many; a further one takes the place of who has been silent for longest."""
+
+PEER_SILENCE_S = 10.0
+"""A peer that has been silent for this long is not written to any more, unless it is the only one."""
+
 
 class UdpTransport(asyncio.DatagramProtocol):
-    """One open socket. `peer` is where `write` goes; without a peer there is nobody to send to.
+    """One open socket.
 
     Args:
         receiver: takes every datagram.
-        learns: whether the sender of the newest datagram becomes the peer (a waiting socket), or the socket
-            is connected and has only one (a calling socket).
+        learns: whether `write` goes to everybody who has spoken lately (a waiting socket), so that it has nobody
+            to send to before somebody has. A calling socket is connected and has only one.
+        broadcast: where `write` goes instead.
     """
 
-    def __init__(self, receiver: Receiver, *, learns: bool) -> None:
+    def __init__(self, receiver: Receiver, *, learns: bool = False, broadcast: Address | None = None) -> None:
         self._receiver = receiver
         self._learns = learns
+        self._broadcast = broadcast
         self._socket: asyncio.DatagramTransport | None = None
         self._closed = asyncio.Event()
         self._full = False
-        self.peer: Address | None = None
+        self._peers: dict[Address, float] = {}  # loop time at which each spoke last, the newest at the end
         self.dropped = 0
         self.refused = 0
         """Times that the network said that nobody listens at the other end."""
@@ -36,7 +44,7 @@ class UdpTransport(asyncio.DatagramProtocol):
     def datagram_received(self, data: bytes, addr: Address) -> None:
         """Hand a datagram on and remember who sent it."""
         if self._learns:
-            self.peer = addr
+            self._remember(addr)
         self._receiver(data)
 
     def error_received(self, exc: Exception) -> None:  # noqa: ARG002 - asyncio's signature
@@ -61,14 +69,31 @@ class UdpTransport(asyncio.DatagramProtocol):
         address: Address = () if self._socket is None else self._socket.get_extra_info("sockname")
         return address
 
+    @property
+    def peers(self) -> tuple[Address, ...]:
+        """Whom a waiting socket writes to, the newest speaker last."""
+        return tuple(self._peers)
+
     def write(self, data: bytes) -> None:
         """Send `data` as one datagram; dropped and counted when there is no peer or the kernel is full."""
         if self._socket is None or self._socket.is_closing() or not data:
             return
-        if self._full or (self._learns and self.peer is None):
+        if self._full or (self._learns and not self._peers):
             self.dropped += 1
             return
-        self._socket.sendto(data, self.peer if self._learns else None)
+        if not self._learns:
+            self._socket.sendto(data, self._broadcast)
+            return
+        for peer in self._peers:
+            self._socket.sendto(data, peer)
+
+    def _remember(self, peer: Address) -> None:
+        now = asyncio.get_running_loop().time()
+        self._peers.pop(peer, None)
+        self._peers[peer] = now
+        oldest = next(iter(self._peers))
+        if len(self._peers) > MOST_PEERS or now - self._peers[oldest] > PEER_SILENCE_S:
+            del self._peers[oldest]
 
     def close(self) -> None:
         """Release the socket."""
@@ -81,7 +106,7 @@ class UdpTransport(asyncio.DatagramProtocol):
 
 
 def udp_in(host: str, port: int) -> Opener:
-    """An `Opener` for a socket bound to host and port, that sends to whoever spoke last."""
+    """An `Opener` for a socket bound to host and port, that sends to everybody who has spoken to it lately."""
 
     async def open_socket(receiver: Receiver) -> UdpTransport:
         loop = asyncio.get_running_loop()
@@ -107,6 +132,29 @@ def udp_out(host: str, port: int) -> Opener:
             )
         except OSError as error:
             raise LinkError(f"cannot reach udp {host}:{port}: {error}") from error
+        return pipe
+
+    return open_socket
+
+
+def udp_broadcast(host: str, port: int) -> Opener:
+    """An `Opener` for a socket that sends to everybody on a network, and hears who answers.
+
+    Args:
+        host: the network's broadcast address, such as 192.168.1.255.
+        port: on which the others listen.
+    """
+
+    async def open_socket(receiver: Receiver) -> UdpTransport:
+        loop = asyncio.get_running_loop()
+        try:
+            _, pipe = await loop.create_datagram_endpoint(
+                lambda: UdpTransport(receiver, broadcast=(host, port)),
+                local_addr=("0.0.0.0", 0),  # noqa: S104 - answers come over whichever network they come
+                allow_broadcast=True,
+            )
+        except OSError as error:
+            raise LinkError(f"cannot broadcast to udp {host}:{port}: {error}") from error
         return pipe
 
     return open_socket

@@ -1,11 +1,22 @@
 """From the URL of a link in the configuration to the opener of its transport."""
 
+from collections.abc import Callable
+
 from arm_companion.errors import ConfigError
 from arm_companion.transport.base import Opener
 from arm_companion.transport.serial import open_serial
-from arm_companion.transport.udp import udp_in, udp_out
+from arm_companion.transport.tcp import tcp_in, tcp_out
+from arm_companion.transport.udp import udp_broadcast, udp_in, udp_out
 
-FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, serial:DEVICE:BAUD"
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD"
+
+_SOCKETS: dict[str, Callable[[str, int], Opener]] = {
+    "udpin": udp_in,
+    "udpout": udp_out,
+    "udpbcast": udp_broadcast,
+    "tcp": tcp_out,
+    "tcpin": tcp_in,
+}
 
 
 def open_url(url: str) -> Opener:
@@ -23,9 +34,17 @@ def open_url(url: str) -> Opener:
         if not 1200 <= value <= 12_000_000:
             raise ConfigError(f"link url {url!r}: baud {value} is outside 1200 to 12000000")
         return open_serial(place, value)
-    if scheme not in ("udpin", "udpout"):
+    if scheme not in _SOCKETS:
         raise ConfigError(f"link url {url!r} is not one of {FORMS}")
     if not 1 <= value <= 65_535:
         raise ConfigError(f"link url {url!r}: port {value} is outside 1 to 65535")
-    host = place.removeprefix("[").removesuffix("]")
-    return udp_in(host, value) if scheme == "udpin" else udp_out(host, value)
+    return _SOCKETS[scheme](place.removeprefix("[").removesuffix("]"), value)
+
+
+def open_bus(port: str, baud: int) -> Opener:
+    """The opener of a servo bus: a serial device at `baud`, or the `tcp:HOST:PORT` of a bridge that has its own.
+
+    Raises:
+        ConfigError: a port that begins with `tcp:` and goes on otherwise.
+    """
+    return open_url(port) if port.startswith("tcp:") else open_serial(port, baud)

@@ -9,8 +9,9 @@ import pytest
 
 from arm_companion.clock import run_simulated
 from arm_companion.errors import ConfigError, LinkError
+from arm_companion.transport import udp
 from arm_companion.transport.memory import MemoryPipe
-from arm_companion.transport.udp import UdpTransport, udp_in, udp_out
+from arm_companion.transport.udp import UdpTransport, udp_broadcast, udp_in, udp_out
 from arm_companion.transport.urls import open_url
 
 HOST = "127.0.0.1"
@@ -27,8 +28,8 @@ def run(main: Coroutine[Any, Any, None]) -> None:
     asyncio.run(main)
 
 
-async def waiting(received: list[bytes]) -> tuple[UdpTransport, int]:
-    pipe = await udp_in(HOST, 0)(received.append)
+async def waiting(received: list[bytes], host: str = HOST) -> tuple[UdpTransport, int]:
+    pipe = await udp_in(host, 0)(received.append)
     assert isinstance(pipe, UdpTransport)
     return pipe, pipe.local[1]
 
@@ -60,25 +61,66 @@ def test_datagrams_pass_both_ways() -> None:
     run(main())
 
 
-def test_a_waiting_socket_answers_whoever_spoke_last() -> None:
+def test_a_waiting_socket_answers_everybody_who_has_spoken_lately(monkeypatch: pytest.MonkeyPatch) -> None:
     async def main() -> None:
         heard: list[bytes] = []
-        first: list[bytes] = []
-        second: list[bytes] = []
+        answers: tuple[list[bytes], list[bytes]] = ([], [])
         pipe, port = await waiting(heard)
         pipe.write(b"nobody is there")
         assert pipe.dropped == 1
-        one = await udp_out(HOST, port)(first.append)
-        two = await udp_out(HOST, port)(second.append)
-        for caller, answers in ((one, first), (two, second), (one, first)):
+        callers = [await udp_out(HOST, port)(answer.append) for answer in answers]
+        for caller in callers:
             heard.clear()
-            answers.clear()
             caller.write(b"?")
             await until(lambda: heard)
-            pipe.write(b"!")
-            await until(lambda answers=answers: answers)
-        assert second == [b"!"]
-        for transport in (one, two, pipe):
+        pipe.write(b"!")
+        await until(lambda: all(answers))
+        assert answers == ([b"!"], [b"!"])
+        monkeypatch.setattr(udp, "PEER_SILENCE_S", 0.0)  # from now on only the newest counts
+        heard.clear()
+        callers[0].write(b"?")
+        await until(lambda: heard)
+        pipe.write(b"!!")
+        await until(lambda: b"!!" in answers[0])
+        await asyncio.sleep(0.01)
+        assert answers[1] == [b"!"]
+        for transport in (*callers, pipe):
+            transport.close()
+            await transport.wait_closed()
+
+    run(main())
+
+
+def test_a_crowd_of_speakers_does_not_pile_up() -> None:
+    async def main() -> None:
+        heard: list[bytes] = []
+        pipe, port = await waiting(heard)
+        callers = [await udp_out(HOST, port)(lambda _: None) for _ in range(udp.MOST_PEERS + 3)]
+        for caller in callers:
+            caller.write(b"?")
+        await until(lambda: len(heard) == len(callers))
+        assert pipe.peers == tuple(caller.local for caller in callers[-udp.MOST_PEERS :])
+        for transport in (*callers, pipe):
+            transport.close()
+            await transport.wait_closed()
+
+    run(main())
+
+
+def test_a_broadcast_reaches_everybody_on_the_network_and_answers_come_back() -> None:
+    async def main() -> None:
+        everybody = "127.255.255.255"  # of the loopback network
+        heard: list[bytes] = []
+        answers: list[bytes] = []
+        ear, port = await waiting(heard, everybody)
+        caster = await udp_broadcast(everybody, port)(answers.append)
+        caster.write(b"who is there?")
+        await until(lambda: heard)
+        ear.write(b"I am")
+        await until(lambda: answers)
+        caster.write(b"and now?")  # it goes on telling everybody, not only who has answered
+        await until(lambda: len(heard) == 2)
+        for transport in (ear, caster):
             transport.close()
             await transport.wait_closed()
 
@@ -91,10 +133,10 @@ def test_a_calling_socket_hears_only_whom_it_calls() -> None:
         pipe, port = await waiting([])
         caller = await udp_out(HOST, port)(heard.append)
         stranger, _ = await waiting([])
-        stranger.peer = caller.local
+        stranger._remember(caller.local)
         stranger.write(b"lies")
         caller.write(b"hello")
-        await until(lambda: pipe.peer)
+        await until(lambda: pipe.peers)
         pipe.write(b"truth")
         await until(lambda: heard)
         assert heard == [b"truth"]
@@ -204,7 +246,15 @@ def test_a_memory_pipe_keeps_the_order_of_what_is_written_at_one_instant() -> No
 
 
 @pytest.mark.parametrize(
-    "url", ["udpin:127.0.0.1:14540", "udpout:example.org:14550", "udpout:[::1]:14550", "serial:/dev/ttyAMA0:921600"]
+    "url",
+    [
+        "udpin:127.0.0.1:14540",
+        "udpout:example.org:14550",
+        "udpout:[::1]:14550",
+        "tcp:[::1]:5760",
+        "tcpin:0.0.0.0:5760",
+        "serial:/dev/ttyAMA0:921600",
+    ],
 )
 def test_good_urls_name_an_opener(url: str) -> None:
     assert callable(open_url(url))
@@ -223,7 +273,9 @@ def test_good_urls_name_an_opener(url: str) -> None:
         ("udpin:127.0.0.1:0", "port 0 is outside 1 to 65535"),
         ("udpout:127.0.0.1:65536", "port 65536 is outside"),
         ("serial:/dev/ttyAMA0:300", "baud 300 is outside"),
-        ("tcp:127.0.0.1:5760", "is not one of"),
+        ("tcp:127.0.0.1", "is not one of"),
+        ("tcpin:0.0.0.0:0", "port 0 is outside"),
+        ("tcpout:127.0.0.1:5760", "is not one of"),
     ],
 )
 def test_bad_urls_are_refused_with_the_forms_that_are_allowed(url: str, reason: str) -> None:
