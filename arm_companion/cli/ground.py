@@ -66,6 +66,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if name == "perch":
             _bar(order)
     _jog(add("jog", "bend the free arm from the keyboard or by numbers, or move the anchored vehicle"))
+    control = add("control", "take primary control, so that other stations may only stow and abort, or give it up")
+    control.add_argument("verb", choices=("take", "release", "take-over"))
     _params(add("params", "list, read or set the parameters of the arm's component"))
     _record(add("record", "write what the arm tells to a file, until Ctrl-C"))
     _plot(add("plot", "draw a record, or what the arm tells now, as a PNG"))
@@ -151,7 +153,7 @@ def _common() -> argparse.ArgumentParser:
         "--connect",
         metavar="URL",
         default=os.environ.get("ARM_COMPANION_CONNECT", _URL),
-        help="udpin://HOST:PORT, udpout://HOST:PORT, tcpout://HOST:PORT or serial://DEVICE:BAUD, to the companion or to "
+        help="udpin://HOST:PORT, udpout://HOST:PORT, tcpout://HOST:PORT or serial://DEVICE:BAUD; the companion or "
         f"the autopilot (default: $ARM_COMPANION_CONNECT, or {_URL}, where `arm-companion sim world` sends)",
     )
     link.add_argument(
@@ -167,7 +169,7 @@ def _common() -> argparse.ArgumentParser:
     link.add_argument("--source-component", type=_id, default=190, metavar="ID", help="our own (default: 190)")
     common.add_argument("--json", action="store_true", help="results as JSON lines on standard output")
     common.add_argument(
-        "--timeout", type=_positive, metavar="S", help="wait for the end (default: while the arm is heard)"
+        "--timeout", type=_positive, metavar="S", help="wait for the end (default: as long as it is heard)"
     )
     return common
 

@@ -8,7 +8,7 @@ import math
 import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
-from typing import Final
+from typing import Any, Final
 
 from arm_companion.cli.ground import DONE, FAILED, INTERRUPTED, USAGE, Action, say, tell
 from arm_companion.clock import ticks
@@ -22,6 +22,8 @@ from arm_companion.ground.reports import Status
 from arm_companion.ground.texts import Text
 
 _TARGET_S: Final = 1.5
+_LEAVE: Final = 3
+"""So many times Ctrl-C leaves an order that is under way."""
 
 
 @contextlib.asynccontextmanager
@@ -46,55 +48,54 @@ async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Await
     started = loop.time()
     task = asyncio.ensure_future(work)
     listener = asyncio.create_task(_repeat_texts(arguments, arm))
-    pressed = 0
     try:
         async with interrupts() as queue:
-            while not task.done():
-                press = asyncio.create_task(queue.get())
-                await asyncio.wait({task, press}, return_when=asyncio.FIRST_COMPLETED)
-                if not press.done():
-                    press.cancel()
-                    break
-                pressed += 1
-                if pressed == 1:
-                    say(arguments, f"{name} goes on. Ctrl-C again: abort. A third time: leave, and the arm carries on.")
-                elif pressed == 2:
-                    say(arguments, "aborting")
-                    abort = asyncio.create_task(_abort(arguments, arm))
-                    press_again = asyncio.create_task(queue.get())
-                    await asyncio.wait({abort, press_again}, return_when=asyncio.FIRST_COMPLETED)
-                    if press_again.done():
-                        pressed = 3
-                    for unfinished in (abort, press_again):
-                        unfinished.cancel()
-                if pressed >= 3:
-                    break
+            presses = await _until_done_or_left(arguments, arm, name, task, queue)
     finally:
         listener.cancel()
-        if not task.done():
-            task.cancel()
-    seconds = round(loop.time() - started, 3)
+        task.cancel()  # does nothing to one that is done
+        await asyncio.wait({task})
     state = arm.status.state if arm.status else ""
-    if pressed >= 3 or (pressed and task.cancelled()):
-        say(arguments, f"left: the arm carries on ({state}). To abort: arm-companion ground abort")
-        tell(arguments, action=arguments.action, result="left", reason="", state=state, seconds=seconds)
+    facts = {"action": arguments.action, "state": state, "seconds": round(loop.time() - started, 3)}
+    if task.cancelled():
+        say(arguments, f"left: the arm carries on ({state or 'state unknown'}). To abort: arm-companion ground abort")
+        tell(arguments, result="left", reason="", **facts)
         return INTERRUPTED
     try:
-        await task
+        task.result()
     except CommandFailed as failed:
         print(f"arm-companion ground: {failed}", file=sys.stderr)
-        tell(
-            arguments,
-            action=arguments.action,
-            result=failed.result,
-            reason=failed.reason,
-            state=state,
-            seconds=seconds,
-        )
-        return INTERRUPTED if pressed else FAILED
-    say(arguments, f"{name} done in {seconds:.1f} s" + (f", state {state}" if state else ""))
-    tell(arguments, action=arguments.action, result="accepted", reason="", state=state, seconds=seconds)
+        tell(arguments, result=failed.result, reason=failed.reason, **facts)
+        return INTERRUPTED if presses else FAILED
+    say(arguments, f"{name} done in {facts['seconds']:.1f} s" + (f", state {state}" if state else ""))
+    tell(arguments, result="accepted", reason="", **facts)
     return DONE
+
+
+async def _until_done_or_left(
+    arguments: argparse.Namespace, arm: Arm, name: str, task: "asyncio.Future[None]", interrupted: "asyncio.Queue[int]"
+) -> int:
+    """Wait for the order, or for the Ctrl-C that leaves; returns how often it was pressed."""
+    presses = 0
+    abort: asyncio.Task[None] | None = None
+    while not task.done() and presses < _LEAVE:
+        press = asyncio.create_task(interrupted.get())
+        either: set[asyncio.Future[Any]] = {task, press}
+        await asyncio.wait(either, return_when=asyncio.FIRST_COMPLETED)
+        if not press.done():
+            press.cancel()
+            break
+        presses += 1
+        if presses == 1:
+            say(arguments, f"{name} goes on. Ctrl-C again: abort. A third time: leave, and the arm carries on.")
+        elif presses < _LEAVE:
+            say(arguments, "aborting")
+            abort = asyncio.create_task(_abort(arguments, arm))
+    if abort is not None:
+        if presses >= _LEAVE:
+            abort.cancel()
+        await asyncio.wait({abort})
+    return presses
 
 
 async def _abort(arguments: argparse.Namespace, arm: Arm) -> None:
@@ -168,7 +169,8 @@ async def _jog(arguments: argparse.Namespace, arm: Arm) -> int:
 
 
 async def _jog_by_keys(arguments: argparse.Namespace, arm: Arm, status: Status) -> int:
-    jog = Jog(*(value if math.isfinite(value) else 0.0 for value in (status.theta, status.delta)))
+    theta, delta = (value if math.isfinite(value) else 0.0 for value in (status.theta, status.delta))
+    jog = Jog(theta, delta)
     say(arguments, HELP)
     listener = asyncio.create_task(_repeat_texts(arguments, arm))
     try:
@@ -194,6 +196,13 @@ async def _jog_by_keys(arguments: argparse.Namespace, arm: Arm, status: Status) 
     state = arm.status.state if arm.status else "unknown"
     say(arguments, f"\njogging ended: the arm holds where it was asked to be, state {state}")
     return DONE
+
+
+async def _control(arguments: argparse.Namespace, arm: Arm) -> int:
+    work = (
+        arm.release_control() if arguments.verb == "release" else arm.take_control(force=arguments.verb == "take-over")
+    )
+    return await follow(arguments, arm, "CONTROL", work)
 
 
 async def _params(arguments: argparse.Namespace, arm: Arm) -> int:
@@ -230,5 +239,6 @@ def _line(parameter: Parameter) -> str:
 ACTIONS: Final[dict[str, Action]] = {
     **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort")},
     "jog": _jog,
+    "control": _control,
     "params": _params,
 }

@@ -27,7 +27,8 @@ _FIRST_S: Final = 3.0
 
 async def _status(arguments: argparse.Namespace, arm: Arm) -> int:
     missing = []
-    for kind in (Status, Tendons, Wrench):
+    kinds: tuple[type[Status | Tendons | Wrench], ...] = (Status, Tendons, Wrench)
+    for kind in kinds:
         try:
             await arm.first(kind, arguments.timeout or _FIRST_S)
         except ArmSilent:
@@ -146,7 +147,7 @@ async def _record(arguments: argparse.Namespace, arm: Arm) -> int:
     path = Path(arguments.output)
     path.parent.mkdir(parents=True, exist_ok=True)
     say(arguments, f"recording to {path}" + ("" if arguments.seconds else "; Ctrl-C ends"))
-    with path.open("w", encoding="utf-8", newline="") as stream:
+    with path.open("w", encoding="utf-8", newline="") as stream:  # noqa: ASYNC230 - once, and nothing else waits
         recording = Recording(stream, format_of(path))
         async for received, entry in _heard(arguments, arm):
             recording.put(received, entry)

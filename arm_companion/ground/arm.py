@@ -5,7 +5,7 @@ import contextlib
 import math
 from collections import deque
 from collections.abc import AsyncIterator
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, overload
 
 from arm_companion.clock import unix_now
 from arm_companion.ground.channel import SILENT_S, Address, ArmSilent, Channel
@@ -30,7 +30,7 @@ _GOALS: Final = {
 }
 """States that end a command; ARM_STATUS tells of them when the final answer gets lost."""
 
-T = TypeVar("T", Status, Wrench, Tendons, Text)
+T = TypeVar("T", bound=Report | Text)
 _UNKNOWN: Final = math.nan
 
 
@@ -152,7 +152,13 @@ class Arm:
         found: T = self._latest[kind][1]
         return found
 
-    async def stream(self, *kinds: type[T], depth: int = 1000, patient: bool = False) -> AsyncIterator[T]:
+    @overload
+    def stream(self, *, depth: int = 1000, patient: bool = False) -> AsyncIterator[Report | Text]: ...
+
+    @overload
+    def stream(self, *kinds: type[T], depth: int = 1000, patient: bool = False) -> AsyncIterator[T]: ...
+
+    async def stream(self, *kinds: type[Any], depth: int = 1000, patient: bool = False) -> AsyncIterator[Any]:
         """Every report from now on, of `Status`, `Wrench`, `Tendons` or `Text`; all of them when none is named.
 
         Ends with the connection's `async with` block at the latest.
@@ -219,6 +225,22 @@ class Arm:
     async def jog_vehicle(self, north: float, east: float, down: float) -> None:
         """Move the anchored vehicle: offset in m, world NED, from where it was at the grip."""
         await self.order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_VEHICLE, north, east, down)
+
+    async def take_control(self, *, force: bool = False) -> None:
+        """Take primary control: other stations may then only stow and abort.
+
+        Args:
+            force: also from a station that holds it and is heard.
+
+        Raises:
+            CommandFailed: another station holds it.
+            ArmSilent: not heard, or no answer.
+        """
+        await self.order(mav.MAV_CMD_ARM_CONTROL, mav.ARM_CONTROL_TAKE_OVER if force else mav.ARM_CONTROL_TAKE)
+
+    async def release_control(self) -> None:
+        """Give primary control up; errors as `take_control`."""
+        await self.order(mav.MAV_CMD_ARM_CONTROL, mav.ARM_CONTROL_RELEASE)
 
     async def order(
         self,

@@ -9,7 +9,6 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final, TypeAlias
 
 from arm_companion.errors import LinkError
-from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec, Message
 from arm_companion.protocol.tunnel import tunnel, unwrap
 

@@ -61,8 +61,8 @@ def _draw_states(axes: Sequence[Axes], statuses: list[tuple[float, Status]], sta
         until = spans[i + 1][1] if i + 1 < len(spans) else end
         for axis in axes:
             axis.axvspan(begin, until, color=_SHADES[i % 2], lw=0, zorder=0)
-        where = {"transform": axes[0].get_xaxis_transform(), "fontsize": 7.5, "color": _INK, "rotation": 30}
-        axes[0].text(begin, 1.02, name.lower(), **where)
+        above = axes[0].get_xaxis_transform()
+        axes[0].text(begin, 1.02, name.lower(), transform=above, fontsize=7.5, color=_INK, rotation=30)
     for axis in axes:
         axis.margins(x=0)
         axis.grid(axis="y", color="#e5e7eb", lw=0.6)

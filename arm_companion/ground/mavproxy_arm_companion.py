@@ -26,6 +26,7 @@ SILENT_S: Final = 5.0
 USAGE: Final = """usage: armc status|ready|perch|grasp|release|stow|abort|clear
        armc jog THETA_DEG [DELTA_DEG]   bend the free arm
        armc vehicle N E D               move the anchored vehicle, m
+       armc control take|release|take-over
        armc component [ID]              component id of the arm"""
 
 _ORDERS: Final = {
@@ -36,6 +37,11 @@ _ORDERS: Final = {
     "stow": mav.MAV_CMD_ARM_STOW,
     "abort": mav.MAV_CMD_ARM_ABORT,
     "clear": mav.MAV_CMD_ARM_CLEAR_ERRORS,
+}
+_CONTROL: Final = {
+    "release": mav.ARM_CONTROL_RELEASE,
+    "take": mav.ARM_CONTROL_TAKE,
+    "take-over": mav.ARM_CONTROL_TAKE_OVER,
 }
 
 
@@ -66,7 +72,7 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
         self._codec = MavlinkCodec(255, 190)
         self._reports: dict[str, Report] = {}
         self._waiting: dict[int, _Waiting] = {}
-        self.add_command("armc", self.command, "continuum arm", ["<status|jog|vehicle|component>", *_ORDERS])
+        self.add_command("armc", self.command, "continuum arm", ["<status|jog|vehicle|control|component>", *_ORDERS])
 
     # Typed --------------------
 
@@ -83,6 +89,8 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
                 self._order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_BEND, theta, delta)
             elif verb == "vehicle" and len(rest) == 3:
                 self._order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_VEHICLE, *(float(word) for word in rest))
+            elif verb == "control" and len(rest) == 1 and rest[0] in _CONTROL:
+                self._order(mav.MAV_CMD_ARM_CONTROL, _CONTROL[rest[0]])
             elif verb == "component" and len(rest) <= 1:
                 self._choose(*rest)
             else:
@@ -126,9 +134,7 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
 
     def _send(self, command: int) -> None:
         waiting = self._waiting[command]
-        self._link().mav.command_long_send(
-            self._system, self.component, command, waiting.sent - 1, *waiting.parameters
-        )
+        self._link().mav.command_long_send(self._system, self.component, command, waiting.sent - 1, *waiting.parameters)
 
     def _link(self) -> Any:
         """The link on which the arm was heard: on another one an autopilot may not know it."""

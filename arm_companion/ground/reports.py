@@ -47,6 +47,7 @@ class Status:
     goal_theta: float
     goal_delta: float
     tip_position: Vector  # m, base axes
+    control: tuple[int, int] = (0, 0)  # system and component that hold primary control; 0: nobody
 
     @classmethod
     def of(cls, message: Message) -> "Status":
@@ -64,6 +65,7 @@ class Status:
             message.goal_theta,
             message.goal_delta,
             _vector(message.tip_position),
+            (message.control_system, message.control_component),
         )
 
 

@@ -81,6 +81,8 @@ def _status(arm: Arm) -> RenderableType:
     plane = f"plane {_degrees(status.delta)} ({_degrees(status.goal_delta)})"
     table.add_row("bend, deg", f"{_degrees(status.theta)} (asked {_degrees(status.goal_theta)})   {plane}")
     table.add_row("tip, mm", "  ".join(_number(1e3 * p, 1) for p in status.tip_position))
+    if status.control != (0, 0):
+        table.add_row("control", "held by {}/{}".format(*status.control))
     table.add_row("facts", ", ".join(status.flags) or "-")
     table.add_row("errors", Line(", ".join(status.errors) or "none", style="bold red" if status.errors else "green"))
     return Panel(table, title="state", title_align="left", border_style=_border(arm, Status))
