@@ -82,6 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
 
         print(as_text(arguments.component), end="")
         return DONE
+    if wrong := _wrong_usage(arguments):
+        print(f"arm-companion ground {arguments.action}: {wrong}", file=sys.stderr)
+        return USAGE
     for name in _needs(arguments):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion ground needs '{name}': pip install 'arm-companion[ground]'", file=sys.stderr)
@@ -139,6 +142,21 @@ def _ended(arguments: argparse.Namespace, code: int, result: str, reason: str, w
         print(f"arm-companion ground: {words or reason}", file=sys.stderr)
     tell(arguments, action=arguments.action, result=result, reason=reason)
     return code
+
+
+def _wrong_usage(arguments: argparse.Namespace) -> str:
+    """What is wrong with options that argparse cannot judge, empty when nothing is."""
+    match arguments.action:
+        case "params":
+            given = (arguments.name is not None, arguments.value is not None)
+            wanted = {"list": (False, False), "get": (True, False), "set": (True, True)}[arguments.verb]
+            return "" if given == wanted else "params list | params get NAME | params set NAME VALUE"
+        case "perch":
+            together = {arguments.bar is None, arguments.bar_axis_deg is None, arguments.bar_radius is None}
+            return "" if len(together) == 1 else "--bar, --bar-axis-deg and --bar-radius belong together"
+        case "jog" if arguments.theta_deg is None and arguments.vehicle is None and not sys.stdin.isatty():
+            return "the keyboard needs a terminal; without one give --theta-deg or --vehicle"
+    return ""
 
 
 def _needs(arguments: argparse.Namespace) -> list[str]:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, Final
 
-from arm_companion.cli.ground import DONE, FAILED, INTERRUPTED, USAGE, Action, say, tell
+from arm_companion.cli.ground import DONE, FAILED, INTERRUPTED, Action, say, tell
 from arm_companion.clock import ticks
 from arm_companion.errors import ArmError
 from arm_companion.ground.arm import Arm
@@ -131,8 +131,6 @@ async def _target(arguments: argparse.Namespace, arm: Arm) -> None:
     Raises:
         ArmError: it is refused, or nothing shows that it has been taken.
     """
-    if arguments.bar_axis_deg is None or arguments.bar_radius is None:
-        raise ArmError("--bar needs --bar-axis-deg and --bar-radius")
     heading = math.radians(arguments.bar_axis_deg)
     north, east, down = arguments.bar
     await arm.target_bar((north, east, down), (math.cos(heading), math.sin(heading), 0.0), arguments.bar_radius)
@@ -158,9 +156,6 @@ async def _jog(arguments: argparse.Namespace, arm: Arm) -> int:
     if arguments.theta_deg is not None:
         theta, delta = math.radians(arguments.theta_deg), math.radians(arguments.delta_deg)
         return await follow(arguments, arm, "JOG", arm.jog_bend(theta, delta))
-    if not sys.stdin.isatty():
-        print("arm-companion ground: jog from the keyboard needs a terminal; or give --theta-deg", file=sys.stderr)
-        return USAGE
     status = await arm.first(Status)
     if status.state != "READY":
         print(f"arm-companion ground: jogging needs state READY, the arm is in {status.state}", file=sys.stderr)
@@ -206,9 +201,6 @@ async def _control(arguments: argparse.Namespace, arm: Arm) -> int:
 
 
 async def _params(arguments: argparse.Namespace, arm: Arm) -> int:
-    if (arguments.name is None) != (arguments.verb == "list") or (arguments.value is None) == (arguments.verb == "set"):
-        print("arm-companion ground: params list | params get NAME | params set NAME VALUE", file=sys.stderr)
-        return USAGE
     if arguments.verb == "list":
         found = await arm.parameters.read_all()
         tell(arguments, parameters=[_plain(p) for p in found])
