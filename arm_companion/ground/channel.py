@@ -5,6 +5,7 @@ heard, because until then an autopilot takes what is addressed to the component 
 """
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from typing import Any, Final, TypeAlias
 
@@ -22,6 +23,8 @@ SILENT_S: Final = 5.0
 
 _FIRST_PRIVATE: Final = 50_000
 _DIRECT_S: Final = 3.0
+_LEARN_S: Final = 1.5
+"""How long after its first heartbeat the component's telemetry is given to show by which way it comes."""
 _AUTOPILOT: Final = 1
 
 
@@ -51,6 +54,7 @@ class Channel:
         self._codec = MavlinkCodec(*address)
         self._watchers: list[Watcher] = []
         self._beat_at = float("-inf")
+        self._first_beat_at = float("inf")
         self._direct_at = float("-inf")
         self.behind_autopilot = False
         """Whether an autopilot's heartbeat comes over this connection."""
@@ -96,6 +100,7 @@ class Channel:
         if name == "HEARTBEAT":
             self.system = system
             self._beat_at = asyncio.get_running_loop().time()
+            self._first_beat_at = min(self._first_beat_at, self._beat_at)
         if not self.system or not self._for_us(message):
             return
         if name == "TUNNEL":
@@ -176,6 +181,15 @@ class Channel:
         if not self.heard:
             raise ArmSilent(f"component {self.component} has not been heard, so nothing is sent to it")
         message = message_of(self.system, self.component, *arguments)
+        if message.id >= _FIRST_PRIVATE:
+            await self._learn_the_way()
         if message.id >= _FIRST_PRIVATE and self.tunnelled:
             message = tunnel(self._codec.encode(message), self.system, self.component)
         await self._send(message)
+
+    async def _learn_the_way(self) -> None:
+        """Wait for telemetry, if the component has just been found: a private message on the wrong way gets lost."""
+        left = self._first_beat_at + _LEARN_S - asyncio.get_running_loop().time()
+        if left > 0.0:
+            with contextlib.suppress(ArmSilent):
+                await self.wait_for(lambda: self._tunnelled or self._direct_at > float("-inf"), left, "")

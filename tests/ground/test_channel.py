@@ -67,6 +67,23 @@ def test_with_an_autopilot_heard_but_no_state_yet_a_tunnel_is_the_safe_guess(scr
     assert [m.get_type() for m in scripted.received] == ["TUNNEL"]
 
 
+@pytest.mark.parametrize("through_autopilot", [True, False])
+def test_just_connected_a_private_message_waits_until_the_way_is_known(
+    scripted: Any, make_status: Make, through_autopilot: bool
+) -> None:
+    scripted.through_autopilot = through_autopilot
+
+    async def main() -> None:
+        asyncio.get_running_loop().call_later(0.3, scripted.say, make_status())
+        await scripted.arm.send_set_point(0.1, 0.0)
+        assert asyncio.get_running_loop().time() == pytest.approx(0.3, abs=0.01)
+        await scripted.arm.send_set_point(0.2, 0.0)
+        assert asyncio.get_running_loop().time() == pytest.approx(0.3, abs=0.01)  # and then it is known
+
+    scripted.run(main)
+    assert [m.get_type() for m in scripted.received] == ["TUNNEL" if through_autopilot else "ARM_SETPOINT"] * 2
+
+
 def test_commands_never_need_a_tunnel(scripted: Any, make_status: Make) -> None:
     scripted.through_autopilot = True
     scripted.script = lambda m: scripted.ack(m.command, 0)
