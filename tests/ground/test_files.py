@@ -48,7 +48,7 @@ def test_a_record_reads_back_as_it_was(make_status: Callable[..., Message]) -> N
     assert repr(back) == repr(entries(make_status))  # repr: NaN is not equal to itself
     stream.seek(0)
     for line in stream:  # strict JSON: no NaN in it
-        json.loads(line, parse_constant=lambda name: pytest.fail(name))
+        json.loads(line, parse_constant=pytest.fail)
 
 
 def test_a_bit_without_a_name_is_shown_as_a_number(make_status: Callable[..., Message]) -> None:

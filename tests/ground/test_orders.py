@@ -110,7 +110,7 @@ def test_a_refusal_without_a_reason_is_told_without_one(scripted: Any) -> None:
     scripted.script = lambda m: scripted.ack(m.command, mav.MAV_RESULT_UNSUPPORTED)
 
     async def main() -> None:
-        with pytest.raises(CommandFailed, match="^GRASP unsupported$"):
+        with pytest.raises(CommandFailed, match=r"^GRASP unsupported$"):
             await scripted.arm.grasp()
 
     scripted.run(main)
