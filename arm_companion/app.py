@@ -14,15 +14,21 @@ from arm_companion.clock import Clock, Tick, ticks
 from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
+from arm_companion.drivers.settings import Settings, state_directory
+from arm_companion.drivers.signing_keys import SigningKeys
+from arm_companion.drivers.standard_services import Power
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.tendons import Tendons
+from arm_companion.drivers.timesync import Timesync
+from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError, DeviceFault
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, State
+from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
@@ -31,6 +37,8 @@ from arm_companion.transport.urls import open_bus, open_url
 log = logging.getLogger(__name__)
 
 _REARM_EVERY_S = 1.0
+_FAREWELL_S = 0.3
+_AT_REST = frozenset({Phase.STARTUP, Phase.STOWED})
 _LEVELS = {
     Severity.CRITICAL: logging.CRITICAL,
     Severity.ERROR: logging.ERROR,
@@ -79,14 +87,32 @@ class Daemon:
         self._recorder = _recorder(config, clock) if recorder is None else recorder
         self._parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
         self._links = [
-            MavlinkLink(name, link.role, openers.links[name], config.vehicle) for name, link in config.links.items()
+            MavlinkLink(name, link.role, openers.links[name], config.vehicle, config=link)
+            for name, link in config.links.items()
         ]
+        self._keys = SigningKeys(config)
+        self._keys.secure(self._links, clock)
+        self._forwarding = Forwarding([link for link in self._links if link.config.forward])
         (autopilot_link,) = (link for link in self._links if link.role == "autopilot")
-        self._autopilot = Autopilot(autopilot_link, config.vehicle)
-        self._component = Component(self._links, config.vehicle, clock)
+        self._timesync = Timesync(autopilot_link, clock)
+        self._autopilot = Autopilot(autopilot_link, config.vehicle, self._timesync)
+        self._settings = Settings(config, state_directory(config))
+        self._settings.stowed, self._settings.apply = self._why_not_stowed, self._apply
+        self._component = Component(
+            self._links,
+            config.vehicle,
+            clock,
+            mavlink=config.mavlink,
+            limits=config.limits,
+            settings=self._settings,
+            on_power=self._end,
+        )
+        self.vehicle_check = VehicleCheck(
+            autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
+        )
         self._telemetry = Telemetry(self._links, config.rates, clock)
         self._bus = ServoBus(openers.servos, config.servos)
-        self._tendons = Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
+        self._tendons = _tendons(config)
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
@@ -94,6 +120,9 @@ class Daemon:
         self.cycles = 0
         self.missed = 0
         self.failures = 0
+        self.power = Power.STOP
+        """What is to follow the end of `run`: another start, or nothing."""
+        self._stop = asyncio.Event()
 
     async def run(self, stop: asyncio.Event) -> None:
         """Serve until `stop` is set, then leave the arm in the present phase's safe action.
@@ -101,12 +130,17 @@ class Daemon:
         Raises:
             BaseExceptionGroup: a part failed in a way that its owner cannot mend.
         """
+        self._stop = stop
         try:
             await run_until(
                 stop,
                 *(link.run for link in self._links),
                 self._autopilot.run,
+                self._timesync.run,
+                self.vehicle_check.run,
                 self._component.run,
+                self._settings.run,
+                self._keys.run,
                 self._bus.run,
                 self._cycles,
             )
@@ -121,6 +155,8 @@ class Daemon:
             finally:
                 for link in self._links:
                     link.close()
+                self._settings.close()
+                self._keys.keep()
                 self._recorder.close()
 
     async def _cycles(self) -> None:
@@ -153,7 +189,19 @@ class Daemon:
             await self._rearm()
         requests, bar = self._component.take()
         self._bar = bar or self._bar
-        return Facts(self._autopilot.state(now), self._tendons.states(servos), tuple(requests), self._bar)
+        guidance = self._component.guidance
+        grasp_target, grasp_target_age_s = guidance.grasp_target
+        return Facts(
+            self._autopilot.state(now),
+            self._tendons.states(servos),
+            tuple(requests),
+            self._bar,
+            guidance.bar_age_s,
+            grasp_target,
+            grasp_target_age_s,
+            guidance.setpoint,
+            self._component.access.ground_age_s,
+        )
 
     async def _rearm(self) -> None:
         """Servos stopped where they were because the bus was silent; goals go on from there."""
@@ -184,7 +232,16 @@ class Daemon:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
-        self._telemetry.publish(now, commands.status, facts.tendons, commands.wrench, commands.pulls)
+        self._telemetry.holder = self._component.access.holder
+        self._telemetry.publish(
+            now,
+            commands.status,
+            facts.tendons,
+            commands.wrench,
+            commands.pulls,
+            stiffness=commands.stiffness,
+            payload=commands.payload,
+        )
 
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""
@@ -200,6 +257,30 @@ class Daemon:
                 self._component.notify(Notice(Severity.CRITICAL, text))
         except Exception:
             log.exception("the safe action failed too")
+
+    # --- what the ground may change ---
+
+    def _why_not_stowed(self) -> str | None:
+        phase = self._state.phase
+        return None if phase in _AT_REST else f"it is {phase.name}"
+
+    def _apply(self, config: Config) -> None:
+        """Another configuration is in force; only values of `config.parameters` differ."""
+        if config.limits != self._config.limits:
+            self._tendons = _tendons(config)
+            self._component.set_limits(config.limits)
+        self._config = config
+        self._parameters = Parameters(config, self._parameters.model)
+        self._telemetry.set_rates(config.rates)
+
+    def _end(self, power: Power) -> None:
+        """Stop in an orderly way, a moment later: the answer to whoever asked has to leave first."""
+        self.power = power
+        asyncio.get_running_loop().call_later(_FAREWELL_S, self._stop.set)
+
+
+def _tendons(config: Config) -> Tendons:
+    return Tendons(config.servos, config.limits, config.arm.pulley_radius_m)
 
 
 def _recorder(config: Config, clock: Clock) -> Recorder:

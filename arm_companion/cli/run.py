@@ -8,7 +8,12 @@ import sys
 from arm_companion.app import Daemon, open_configured
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
+from arm_companion.drivers.settings import with_kept_changes
+from arm_companion.drivers.standard_services import Power
 from arm_companion.supervisor import ServiceManager, stop_on_signals
+
+START_AGAIN = 75
+"""Exit code after PREFLIGHT_REBOOT_SHUTDOWN asked for a restart; systemd takes it for a failure and starts anew."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -18,25 +23,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run the daemon until SIGTERM or SIGINT; exit code 0 after an orderly stop."""
+    """Run the daemon until SIGTERM or SIGINT; exit code 0 after an orderly stop, 75 when it is to be started again."""
     logging.basicConfig(
         level=logging.DEBUG if arguments.verbose else logging.INFO,
         format="%(levelname)s %(name)s: %(message)s",
         stream=sys.stderr,
     )
-    config = load_from(arguments)
+    config = with_kept_changes(load_from(arguments))
 
-    async def main() -> None:
+    async def main() -> int:
         stop = asyncio.Event()
         restore = stop_on_signals(stop)
         manager = ServiceManager()
         try:
             clock = Clock(asyncio.get_running_loop(), unix_now())
-            await Daemon(config, open_configured(config), clock, manager).run(stop)
+            daemon = Daemon(config, open_configured(config), clock, manager)
+            await daemon.run(stop)
+            return START_AGAIN if daemon.power is Power.RESTART else 0
         finally:
             restore()
             manager.close()
 
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        runner.run(main())
-    return 0
+        return runner.run(main())

@@ -336,7 +336,7 @@ class RatesConfig:
     status_hz: float = option("ARM_STATUS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     tendons_hz: float = option("ARM_TENDONS", 10.0, unit="Hz", lower=0.0, upper=100.0)
     wrench_hz: float = option("ARM_REACTION_WRENCH", 20.0, unit="Hz", lower=0.0, upper=200.0)
-    stiffness_hz: float = option("ARM_STIFFNESS", 0.0, unit="Hz", lower=0.0, upper=20.0)
+    stiffness_hz: float = option("ARM_STIFFNESS", 1.0, unit="Hz", lower=0.0, upper=20.0)
     payload_hz: float = option("ARM_PAYLOAD, while one is estimated", 1.0, unit="Hz", lower=0.0, upper=50.0)
     mirrors_hz: float = option("NAMED_VALUE_FLOAT and DEBUG_FLOAT_ARRAY", 1.0, unit="Hz", lower=0.0, upper=20.0)
 

@@ -15,6 +15,7 @@ from arm_companion.drivers.flight_stack import (
     mode_name,
 )
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.drivers.timesync import Timesync
 from arm_companion.errors import ProtocolError
 from arm_companion.mission.facts import Control, Quaternion, Setpoint, Vec3, VehicleState
 from arm_companion.protocol.dialect import mav
@@ -34,6 +35,15 @@ CHECK_PERIOD_S: Final = 1.0
 
 _ENOUGH: Final = 0.5
 """Share of the asked rate that counts as flowing: PX4 gives 124 Hz where 200 are asked."""
+
+_GIVE_UP: Final = 5
+"""Checks in a row after which a stream counts as one that the autopilot does not give."""
+
+_SURE_S: Final = 0.02
+"""A state's own time stamp is believed when the clocks are known to agree this well."""
+
+_SAME_CLOCK_S: Final = 5.0
+"""A stamp that is farther from its arrival was made by another clock than TIMESYNC's."""
 
 _REBOOT_BACK_MS: Final = 1000
 """A boot time that goes back by more than this belongs to a new boot, not to a late frame."""
@@ -59,12 +69,14 @@ class Autopilot:
     Args:
         link: connection to the autopilot.
         vehicle: flight stack, rates and time-outs.
+        timesync: how its clock stands against ours; without it states count from their arrival.
     """
 
-    def __init__(self, link: MavlinkLink, vehicle: VehicleConfig) -> None:
+    def __init__(self, link: MavlinkLink, vehicle: VehicleConfig, timesync: Timesync | None = None) -> None:
         self.counters = AutopilotCounters()
         self._link = link
         self._config = vehicle
+        self._timesync = timesync
         self._finder = AutopilotFinder(vehicle)
         self._rates = {
             ATTITUDE: vehicle.state_rate_hz,
@@ -72,6 +84,9 @@ class Autopilot:
             LANDED: LANDED_RATE_HZ,
         }
         self._arrived = dict.fromkeys(self._rates, 0)
+        self._slow = dict.fromkeys(self._rates, 0)  # checks in a row at which too little had come
+        self.slow_streams: dict[str, tuple[float, float]] = {}
+        """Messages that stay too slow however often they are asked for: rate asked for and rate measured, Hz."""
         self._refused: set[int] = set()
         self._boot_ms: dict[int, int] = {}
         self._check_now = asyncio.Event()
@@ -93,6 +108,11 @@ class Autopilot:
         """The autopilot's system id, 0 until it has been heard."""
         return self._finder.system_id
 
+    @property
+    def heard(self) -> bool:
+        """Whether the autopilot has been heard at all."""
+        return self._heartbeat is not None
+
     def state(self, now: float) -> VehicleState:
         """Newest state of the vehicle.
 
@@ -113,6 +133,7 @@ class Autopilot:
             heartbeat_age_s=now - self._heartbeat_at,
             position_age_s=now - self._position_at,
             attitude_age_s=now - self._attitude_at,
+            clock_error_s=float("inf") if self._timesync is None else self._timesync.error_s,
         )
 
     def send(self, setpoint: Setpoint, now: float) -> None:
@@ -127,8 +148,9 @@ class Autopilot:
         if self._heartbeat is None:
             self.counters.setpoints_unsent += 1
             return
+        stamp = None if self._timesync is None else self._timesync.autopilot_time(now)
         message = mav.MAVLink_set_position_target_local_ned_message(
-            int(now * 1e3) & 0xFFFFFFFF,
+            int((now if stamp is None else max(stamp, 0.0)) * 1e3) & 0xFFFFFFFF,
             self.system_id,
             AUTOPILOT_COMPONENT,
             mav.MAV_FRAME_LOCAL_NED,
@@ -159,10 +181,19 @@ class Autopilot:
             self._check_now.clear()
             elapsed = loop.time() - since
             for id_, rate in self._rates.items():
-                if fresh or self._arrived[id_] < _ENOUGH * rate * elapsed:
+                enough = self._arrived[id_] >= _ENOUGH * rate * elapsed
+                if fresh or not enough:
                     self._request(id_, rate)
+                self._judge(id_, rate, self._arrived[id_] / max(elapsed, 1e-3), slow=not (fresh or enough))
                 self._arrived[id_] = 0
             since = loop.time()
+
+    def _judge(self, id_: int, asked: float, got: float, *, slow: bool) -> None:
+        self._slow[id_] = self._slow[id_] + 1 if slow else 0
+        name = mav.mavlink_map[id_].msgname
+        self.slow_streams.pop(name, None)
+        if self._slow[id_] >= _GIVE_UP:
+            self.slow_streams[name] = (asked, got)
 
     def _request(self, id_: int, rate_hz: float) -> None:
         message = mav.MAVLink_command_long_message(
@@ -231,7 +262,7 @@ class Autopilot:
         if self._arrival(ATTITUDE, m.time_boot_ms):
             self._attitude = (q[0] / norm, q[1] / norm, q[2] / norm, q[3] / norm)
             self._rate = rate
-            self._attitude_at = now
+            self._attitude_at = self._measured_at(m.time_boot_ms, now)
 
     def _on_position(self, m: Message, now: float) -> None:
         position, velocity = (m.x, m.y, m.z), (m.vx, m.vy, m.vz)
@@ -240,7 +271,14 @@ class Autopilot:
             return
         if self._arrival(POSITION, m.time_boot_ms):
             self._position, self._velocity = position, velocity
-            self._position_at = now
+            self._position_at = self._measured_at(m.time_boot_ms, now)
+
+    def _measured_at(self, boot_ms: int, now: float) -> float:
+        """Loop time of a state: by its own stamp where the clocks are tied together, else its arrival."""
+        if self._timesync is None or self._timesync.error_s > _SURE_S:
+            return now
+        at = self._timesync.loop_time(boot_ms * 1e-3)
+        return now if at is None or abs(now - at) > _SAME_CLOCK_S else min(now, at)
 
     def _arrival(self, id_: int, boot_ms: int) -> bool:
         """Count a state message and see whether the autopilot has booted anew; False for a late one."""
@@ -250,6 +288,8 @@ class Autopilot:
             self.counters.reboots += 1
             self._boot_ms.clear()
             self._check_now.set()
+            if self._timesync is not None:
+                self._timesync.forget()
         elif boot_ms < last:
             return False
         self._boot_ms[id_] = boot_ms

@@ -6,23 +6,17 @@ A request lives from the command that starts it to its final answer. A sender th
 
 import itertools
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
 from arm_companion.clock import Clock
-from arm_companion.config.schema import VehicleConfig
-from arm_companion.drivers.commands import (
-    URGENT,
-    Command,
-    is_ours,
-    name_of,
-    order_of,
-    read_parameters,
-)
+from arm_companion.drivers.access import Access, Sender
+from arm_companion.drivers.commands import URGENT, Command, Translation, name_of
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.status_text import Speaker
 from arm_companion.errors import CommandRejected
-from arm_companion.mission.facts import Answer, Notice, Request, Result, Severity
+from arm_companion.mission.facts import Answer, Notice, Order, Request, Result, Severity
 from arm_companion.protocol.dialect import mav
 
 log = logging.getLogger(__name__)
@@ -43,6 +37,9 @@ _RESULTS: Final = {
 }
 
 
+_URGENT_COMMANDS: Final = frozenset(getattr(mav, f"MAV_CMD_ARM_{order.name}") for order in URGENT)
+
+
 @dataclass(slots=True)
 class CommandCounters:
     """What came in since the start."""
@@ -52,7 +49,12 @@ class CommandCounters:
     denied: int = 0
     unsupported: int = 0
     forbidden: int = 0  # by a sender that may not command
+    cancelled: int = 0  # by COMMAND_CANCEL
     stray_answers: int = 0  # answers to a request that nobody waits for
+
+
+Immediate = Callable[[Command, MavlinkLink], int]
+"""Carries out a command at once: MAV_RESULT, or `CommandRejected` with the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +71,7 @@ class _Key:
 class _Ask:
     """A request under way and who waits for its outcome."""
 
-    key: _Key
+    key: _Key | None  # None: nobody waits
     link: MavlinkLink  # on which it came last
     progress: int = 255
 
@@ -86,24 +88,27 @@ class CommandService:
     """Takes commands that are addressed to us and answers them.
 
     Args:
-        vehicle: who may command.
+        access: who may command.
+        translation: what is meant by a command.
         speaker: says why a command is refused.
         clock: ages final answers.
     """
 
-    def __init__(self, vehicle: VehicleConfig, speaker: Speaker, clock: Clock) -> None:
+    def __init__(self, access: Access, translation: Translation, speaker: Speaker, clock: Clock) -> None:
         self.counters = CommandCounters()
-        self._commanders = frozenset(vehicle.commanders)
+        self._access = access
+        self._translation = translation
         self._speaker = speaker
         self._clock = clock
         self._ids = itertools.count(1)
         self._waiting: list[Request] = []
         self._asks: dict[int, _Ask] = {}
         self._done: dict[_Key, _Done] = {}
+        self._immediate: dict[int, Immediate] = {}
 
-    def may_command(self, system: int) -> bool:
-        """Whether a system's wishes count at all."""
-        return not self._commanders or system in self._commanders
+    def serve(self, command: int, immediate: Immediate) -> None:
+        """Carry out a MAV_CMD at once by `immediate`, which says itself who may ask for it."""
+        self._immediate[command] = immediate
 
     def take(self) -> list[Request]:
         """Requests that have come since the last call, in order."""
@@ -114,15 +119,49 @@ class CommandService:
     def handle(self, command: Command, link: MavlinkLink) -> None:
         """Take a command that is addressed to us: it becomes a request, or is answered right here."""
         self.counters.commands += 1
-        if is_ours(command.command):
-            self._order(command, link)
-        elif command.command == mav.MAV_CMD_REQUEST_MESSAGE:
-            self._reply(link, command, self._request_message(command, link))
-        elif command.command == mav.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self._reply(link, command, self._set_interval(command, link))
-        else:
-            self.counters.unsupported += 1
-            self._reply(link, command, mav.MAV_RESULT_UNSUPPORTED)
+        try:
+            immediate = self._immediate.get(command.command)
+            if immediate is None:
+                self._order(command, link)
+                return
+            result = immediate(command, link)
+        except CommandRejected as rejected:
+            self._refuse(link, command, rejected.reason)
+            return
+        self.counters.unsupported += result == mav.MAV_RESULT_UNSUPPORTED
+        self.counters.denied += result == mav.MAV_RESULT_DENIED
+        self._reply(link, command, result)
+
+    def reject_for_now(self, command: Command, link: MavlinkLink, reason: str) -> int:
+        """Say why a command cannot be carried out at the moment; what an `Immediate` then returns."""
+        self._explain(link, command.command, "temporarily rejected", reason)
+        return int(mav.MAV_RESULT_TEMPORARILY_REJECTED)
+
+    def cancel(self, command: int, sender: Sender, link: MavlinkLink) -> None:
+        """COMMAND_CANCEL: give up a command of anybody's that is under way; it is answered with CANCELLED.
+
+        What waits is taken back. What the mission carries out ends by an ABORT. A cancel that is repeated because
+        the answer got lost gets the answer again, and one that comes too late is ignored.
+        """
+        try:
+            self._access.require(sender, urgent=True)
+        except CommandRejected as rejected:
+            self.counters.forbidden += 1
+            self._explain(link, command, "goes on: cancel denied", rejected.reason)
+            return
+        running = {i: ask.key for i, ask in self._asks.items() if ask.key is not None and ask.key.command == command}
+        if not running:
+            for key, done in self._done.items():
+                if key.command == command and done.answer.result is Result.CANCELLED:
+                    self._acknowledge(link, key, mav.MAV_RESULT_CANCELLED)
+            return
+        self.counters.cancelled += 1
+        taken_back = {request.id for request in self._waiting} & running.keys()
+        self._waiting = [request for request in self._waiting if request.id not in taken_back]
+        for request in taken_back:
+            self.answer(Answer(request, Result.CANCELLED, "asked to"))
+        if running.keys() - taken_back:
+            self._submit(Order.ABORT, (), _Ask(None, link))
 
     def answer(self, answer: Answer) -> None:
         """Tell whoever asked. Progress may be told often; the first other result ends the request."""
@@ -134,27 +173,30 @@ class CommandService:
             ask.progress = answer.progress
         else:
             del self._asks[answer.request]
-            self._done[ask.key] = _Done(answer, self._clock.now())
+            if ask.key is not None:
+                self._done[ask.key] = _Done(answer, self._clock.now())
             if answer.result is not Result.ACCEPTED:
                 self.counters.denied += answer.result is Result.DENIED
-                self._explain(ask.link, ask.key.command, answer.result.value.replace("_", " "), answer.reason)
-        self._acknowledge(ask.link, ask.key, _RESULTS[answer.result], answer.progress)
+                command = mav.MAV_CMD_ARM_ABORT if ask.key is None else ask.key.command
+                self._explain(ask.link, command, answer.result.value.replace("_", " "), answer.reason)
+        if ask.key is not None:
+            self._acknowledge(ask.link, ask.key, _RESULTS[answer.result], answer.progress)
 
     def _order(self, command: Command, link: MavlinkLink) -> None:
-        order = order_of(command.command)
-        if not self.may_command(command.system):
-            self.counters.forbidden += 1
-            self._refuse(link, command, f"system {command.system} may not command the arm")
-            return
-        if order is None:
+        """Make a request of a command.
+
+        Raises:
+            CommandRejected: it is wrong, or its sender may not give it.
+        """
+        translated = None
+        if self._translation.knows(command.command):
+            self._require(command, urgent=command.command in _URGENT_COMMANDS)
+            translated = self._translation.order(command)
+        if translated is None:
             self.counters.unsupported += 1
             self._reply(link, command, mav.MAV_RESULT_UNSUPPORTED)
             return
-        try:
-            parameters = read_parameters(order, command)
-        except CommandRejected as rejected:
-            self._refuse(link, command, rejected.reason)
-            return
+        order, parameters = translated
         key = _Key(command.system, command.component, command.command, parameters)
         if self._repeat(key, command.confirmation, link):
             return
@@ -162,12 +204,22 @@ class CommandService:
             self._explain(link, command.command, "rejected", "too many commands at once")
             self._reply(link, command, mav.MAV_RESULT_TEMPORARILY_REJECTED)
             return
+        self._submit(order, parameters, _Ask(key, link))
+
+    def _require(self, command: Command, *, urgent: bool) -> None:
+        try:
+            self._access.require(command.sender, urgent=urgent)
+        except CommandRejected:
+            self.counters.forbidden += 1
+            raise
+
+    def _submit(self, order: Order, parameters: tuple[float, ...], ask: _Ask) -> None:
         if len(self._asks) >= _MOST_RUNNING:
             forgotten = next(iter(self._asks))
             log.warning("request %d was never answered", forgotten)
             del self._asks[forgotten]
         request = Request(next(self._ids), order, parameters)
-        self._asks[request.id] = _Ask(key, link)
+        self._asks[request.id] = ask
         self._waiting.append(request)
 
     def _repeat(self, key: _Key, confirmation: int, link: MavlinkLink) -> bool:
@@ -188,22 +240,6 @@ class CommandService:
     def _forget_old_answers(self) -> None:
         oldest = self._clock.now() - REPEAT_S
         self._done = {key: done for key, done in self._done.items() if done.at > oldest}
-
-    def _request_message(self, command: Command, link: MavlinkLink) -> int:
-        id_, about = command.parameters[:2]
-        if id_ == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL and 0 <= about <= 0xFFFF:
-            link.send(mav.MAVLink_message_interval_message(int(about), link.streams.interval_us(about)))
-        elif not link.streams.ask(id_):
-            self.counters.unsupported += 1
-            return int(mav.MAV_RESULT_UNSUPPORTED)
-        return int(mav.MAV_RESULT_ACCEPTED)
-
-    def _set_interval(self, command: Command, link: MavlinkLink) -> int:
-        id_, interval_us = command.parameters[:2]
-        if link.streams.set_interval(id_, interval_us):
-            return int(mav.MAV_RESULT_ACCEPTED)
-        self.counters.denied += 1
-        return int(mav.MAV_RESULT_DENIED)
 
     def _reply(self, link: MavlinkLink, command: Command, result: int) -> None:
         self._acknowledge(link, _Key(command.system, command.component, command.command, ()), result)

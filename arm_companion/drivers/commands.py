@@ -1,9 +1,11 @@
-"""Commands of the dialect: from COMMAND_LONG and COMMAND_INT to checked orders."""
+"""Commands of the dialect and their standard relatives: from COMMAND_LONG and COMMAND_INT to checked orders."""
 
 import math
 from dataclasses import dataclass
 from typing import Final
 
+from arm_companion.config.schema import LimitsConfig, MavlinkConfig
+from arm_companion.drivers.access import Sender
 from arm_companion.errors import CommandRejected
 from arm_companion.mission.facts import Order
 from arm_companion.protocol.dialect import mav
@@ -17,8 +19,17 @@ class Command:
     command: int  # MAV_CMD
     parameters: tuple[float, ...]  # the seven of COMMAND_LONG, unchecked
     confirmation: int  # 0 the first time; COMMAND_INT has none
-    system: int  # of the sender
-    component: int
+    sender: Sender
+
+    @property
+    def system(self) -> int:
+        """System id of the sender."""
+        return self.sender.system
+
+    @property
+    def component(self) -> int:
+        """Component id of the sender."""
+        return self.sender.component
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,15 +82,27 @@ _NAMES: Final = {
     mav.MAV_CMD_ARM_CALIBRATE: "CALIBRATE",
     mav.MAV_CMD_ARM_CLEAR_ERRORS: "CLEAR_ERRORS",
     mav.MAV_CMD_ARM_FEEDFORWARD: "FEEDFORWARD",
+    mav.MAV_CMD_ARM_CONTROL: "CONTROL",
+    mav.MAV_CMD_DO_GRIPPER: "DO_GRIPPER",
+    mav.MAV_CMD_DO_SET_ACTUATOR: "DO_SET_ACTUATOR",
+    mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: "PREFLIGHT_REBOOT_SHUTDOWN",
 }
 
 URGENT: Final = frozenset({Order.STOW, Order.ABORT})
 """Ways to safety: taken whatever else waits, and whatever their unused parameters hold."""
 
 
+_OURS: Final = range(64_000, 64_100)
+_CONTROL: Final = Parameter(1, "action", 0, 2, whole=True)
+_CALIBRATION_STEP: Final = Parameter(1, "step", 0, 1, whole=True)
+_ENABLE: Final = Parameter(1, "enable", 0, 1, whole=True)
+_GRIPPER_ACTION: Final = Parameter(2, "action", 0, 1, whole=True)
+_ACTUATOR_SET: Final = Parameter(7, "index", 0, 0, whole=True)
+
+
 def is_ours(command: int) -> bool:
     """Whether the command is one of this dialect, and so nobody else's."""
-    return command in _NAMES
+    return command in _NAMES and command in _OURS
 
 
 def name_of(command: int) -> str:
@@ -88,11 +111,11 @@ def name_of(command: int) -> str:
 
 
 def order_of(command: int) -> Order | None:
-    """The order that a command stands for; None for one that this version cannot carry out."""
-    return Order.__members__.get(_NAMES.get(command, ""))
+    """The order that a command of the dialect stands for; None for one that this version cannot carry out."""
+    return Order.__members__.get(_NAMES.get(command, "")) if is_ours(command) else None
 
 
-def read_command(message: Message) -> Command:
+def read_command(message: Message, sender: Sender) -> Command:
     """The content of a COMMAND_LONG or COMMAND_INT."""
     if message.get_msgId() == mav.MAVLINK_MSG_ID_COMMAND_LONG:
         last = (message.param5, message.param6, message.param7)
@@ -101,7 +124,7 @@ def read_command(message: Message) -> Command:
         last = (float(message.x), float(message.y), message.z)
         confirmation = 0
     parameters = (message.param1, message.param2, message.param3, message.param4, *last)
-    return Command(message.command, parameters, confirmation, message.get_srcSystem(), message.get_srcComponent())
+    return Command(message.command, parameters, confirmation, sender)
 
 
 def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
@@ -122,4 +145,81 @@ def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
             if kind == JOG_VEHICLE:
                 return (kind, *(p.read(command) for p in _OFFSET))
             raise CommandRejected("jogging by tip position is not available")
+        case "CALIBRATE":
+            return (_CALIBRATION_STEP.read(command),)
+        case "FEEDFORWARD":
+            return (_ENABLE.read(command),)
     return ()
+
+
+def read_control(command: Command) -> int:
+    """What MAV_CMD_ARM_CONTROL asks for, ARM_CONTROL.
+
+    Raises:
+        CommandRejected: the parameter is none.
+    """
+    return int(_CONTROL.read(command))
+
+
+class Translation:
+    """Standard commands that mean one of our orders.
+
+    Args:
+        mavlink: what a gripper's grab means, and which actuator bends the arm.
+        limits: the bend that an actuator's 1.0 means.
+        component_id: ours, which is also the number of our gripper.
+    """
+
+    def __init__(self, mavlink: MavlinkConfig, limits: LimitsConfig, component_id: int) -> None:
+        self.limits = limits
+        self._grab = mavlink.grab.upper()
+        self._actuator = mavlink.actuator
+        self._component_id = component_id
+
+    def knows(self, command: int) -> bool:
+        """Whether a MAV_CMD may stand for an order at all."""
+        return is_ours(command) or command in (mav.MAV_CMD_DO_GRIPPER, mav.MAV_CMD_DO_SET_ACTUATOR)
+
+    def names_us(self, command: Command) -> bool:
+        """Whether a command to everybody of our system is ours: nobody else knows it, or it names our gripper.
+
+        PX4 sends the DO_GRIPPER and DO_SET_ACTUATOR of its mission to component 0.
+        """
+        match command.command:
+            case mav.MAV_CMD_DO_GRIPPER:
+                return command.parameters[0] == self._component_id
+            case mav.MAV_CMD_DO_SET_ACTUATOR:
+                return bool(self._actuator) and math.isfinite(command.parameters[self._actuator - 1])
+        return is_ours(command.command)
+
+    def order(self, command: Command) -> tuple[Order, tuple[float, ...]] | None:
+        """The order with its parameters, checked; None when this version has no such order.
+
+        Raises:
+            CommandRejected: with the reason in words.
+        """
+        match command.command:
+            case mav.MAV_CMD_DO_GRIPPER:
+                return self._gripper(command)
+            case mav.MAV_CMD_DO_SET_ACTUATOR:
+                return self._set_actuator(command)
+        order = order_of(command.command)
+        return None if order is None else (order, read_parameters(order, command))
+
+    def _gripper(self, command: Command) -> tuple[Order, tuple[float, ...]] | None:
+        number = command.parameters[0]
+        if number not in (0.0, self._component_id):
+            raise CommandRejected(f"param1 = {number:g} is another gripper; this one is {self._component_id}")
+        if _GRIPPER_ACTION.read(command) == mav.GRIPPER_ACTION_RELEASE:
+            return Order.RELEASE, ()
+        order = Order.__members__.get(self._grab)
+        if order is None:
+            return None
+        return order, (float(ANCHOR),) if order is Order.PERCH else ()
+
+    def _set_actuator(self, command: Command) -> tuple[Order, tuple[float, ...]] | None:
+        if not self._actuator:
+            return None
+        _ACTUATOR_SET.read(command)
+        value = Parameter(self._actuator, "actuator", -1.0, 1.0).read(command)
+        return Order.JOG, (float(JOG_BEND), value * self.limits.bend_max_rad, 0.0)

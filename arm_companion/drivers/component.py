@@ -2,21 +2,29 @@
 
 import enum
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
 from typing import Final
 
 from arm_companion.clock import Clock, ticks
-from arm_companion.config.schema import VehicleConfig
+from arm_companion.config.schema import LimitsConfig, MavlinkConfig, VehicleConfig
+from arm_companion.drivers.access import Access, sender_of
 from arm_companion.drivers.command_service import CommandService
-from arm_companion.drivers.commands import is_ours, read_command
+from arm_companion.drivers.commands import URGENT, Translation, is_ours, read_command
+from arm_companion.drivers.component_metadata import GENERAL, metadata_files, uri
 from arm_companion.drivers.flight_stack import AutopilotFinder
-from arm_companion.drivers.mavlink_link import MavlinkLink
+from arm_companion.drivers.ftp_server import FtpServer
+from arm_companion.drivers.guidance import Guidance
+from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.drivers.parameter_service import IDS as PARAMETER_IDS
+from arm_companion.drivers.parameter_service import ParameterService
+from arm_companion.drivers.settings import Settings
+from arm_companion.drivers.standard_services import Power, StandardServices
 from arm_companion.drivers.status_text import Speaker
-from arm_companion.drivers.targets import read_bar
-from arm_companion.errors import CommandRejected
-from arm_companion.mission.facts import Answer, Bar, Notice, Request, Severity
+from arm_companion.mission.facts import Answer, Bar, Notice, Request
 from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.ftp import crc32
 from arm_companion.protocol.mavlink import Message
 
 log = logging.getLogger(__name__)
@@ -24,7 +32,12 @@ log = logging.getLogger(__name__)
 HEARTBEAT: Final = mav.MAVLINK_MSG_ID_HEARTBEAT
 HEARTBEAT_PERIOD_S: Final = 1.0
 
-_COMPLAINT_PERIOD_S: Final = 2.0
+CAPABILITIES: Final = (
+    mav.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    | mav.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
+    | mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
+    | mav.MAV_PROTOCOL_CAPABILITY_FTP
+)
 
 
 class SystemStatus(enum.IntEnum):
@@ -44,7 +57,6 @@ class ComponentCounters:
     """What came in since the start, besides commands."""
 
     not_for_us: int = 0  # addressed to another system or component
-    bad_targets: int = 0  # ARM_TARGETs that cannot be used, or may not be set by their sender
 
 
 class Component:
@@ -54,28 +66,64 @@ class Component:
         links: all links; those with role "autopilot" tell the system id.
         vehicle: our ids and who may command.
         clock: the loop's time.
+        mavlink: rules of the component; the defaults without.
+        limits: what may be asked of the arm; the defaults without.
+        settings: what the ground may read and change as parameters; without, there are none.
+        on_power: ends the daemon when PREFLIGHT_REBOOT_SHUTDOWN asks for it; without, nobody can.
     """
 
-    def __init__(self, links: Sequence[MavlinkLink], vehicle: VehicleConfig, clock: Clock) -> None:
+    def __init__(
+        self,
+        links: Sequence[MavlinkLink],
+        vehicle: VehicleConfig,
+        clock: Clock,
+        *,
+        mavlink: MavlinkConfig | None = None,
+        limits: LimitsConfig | None = None,
+        settings: Settings | None = None,
+        on_power: Callable[[Power], None] | None = None,
+    ) -> None:
+        mavlink = MavlinkConfig() if mavlink is None else mavlink
+        limits = LimitsConfig() if limits is None else limits
         self.counters = ComponentCounters()
         self.status = SystemStatus.BOOT
         """What the heartbeat says of us."""
         self._links = links
         self._clock = clock
+        self._started = clock.now()
         self._speaker = Speaker(links)
-        self.commands = CommandService(vehicle, self._speaker, clock)
+        self.access = Access(vehicle, mavlink, clock, self.notify)
+        self._translation = Translation(mavlink, limits, vehicle.component_id)
+        self.commands = CommandService(self.access, self._translation, self._speaker, clock)
+        self.services = StandardServices(
+            self.commands,
+            self.access,
+            vehicle.component_id,
+            self._busy if on_power else lambda: "it runs embedded",
+            on_power or (lambda _: None),
+        )
+        self.guidance = Guidance(self.access, mavlink, limits, self._speaker, clock)
         self._finder = AutopilotFinder(vehicle)
         self._follow_autopilot = not vehicle.system_id
-        self._bar: Bar | None = None
-        self._complained = float("-inf")
+        self._armed = False
+        self._settings = settings
+        self.parameters = None if settings is None else ParameterService(settings, self.access, self._speaker)
+        files = metadata_files(vehicle.component_id)
+        self.files = FtpServer(files)
+        self._general = (uri(vehicle.component_id, GENERAL).encode(), crc32(files[GENERAL]))
+        self.services.offer(mav.MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC, lambda _: self._information())
+        self.services.offer(mav.MAVLINK_MSG_ID_COMPONENT_METADATA, lambda _: self._metadata())
         for link in links:
             link.streams.offer(HEARTBEAT, 1.0 / HEARTBEAT_PERIOD_S, fixed=True)
             link.subscribe_open(self._beat)
             link.subscribe(self._on_command, (mav.MAVLINK_MSG_ID_COMMAND_LONG, mav.MAVLINK_MSG_ID_COMMAND_INT))
-            link.subscribe(self._on_target, (mav.MAVLINK_MSG_ID_ARM_TARGET,))
+            link.subscribe(self._on_cancel, (mav.MAVLINK_MSG_ID_COMMAND_CANCEL,))
+            link.subscribe(self._on_guidance, (mav.MAVLINK_MSG_ID_ARM_TARGET, mav.MAVLINK_MSG_ID_ARM_SETPOINT))
+            link.subscribe(self._on_parameter, PARAMETER_IDS)
+            link.subscribe(self._on_file_transfer, (mav.MAVLINK_MSG_ID_FILE_TRANSFER_PROTOCOL,))
+            link.subscribe(self._on_timesync, (mav.MAVLINK_MSG_ID_TIMESYNC,))
             link.subscribe(self._on_ping, (mav.MAVLINK_MSG_ID_PING,))
-            if link.role == "autopilot":
-                link.subscribe(self._on_heartbeat, (HEARTBEAT,))
+            link.subscribe(self._on_heartbeat, (HEARTBEAT,))
 
     @property
     def active(self) -> bool:
@@ -88,8 +136,10 @@ class Component:
 
     def take(self) -> tuple[list[Request], Bar | None]:
         """What has come since the last call: requests in order, and the newest target."""
-        bar, self._bar = self._bar, None
-        return self.commands.take(), bar
+        requests = self.commands.take()
+        if any(request.order in URGENT for request in requests):
+            self.guidance.drop_setpoint()  # the arm goes another way
+        return requests, self.guidance.take_bar()
 
     def answer(self, answer: Answer) -> None:
         """Tell whoever asked. Progress may be told often; the first other result ends the request."""
@@ -101,9 +151,19 @@ class Component:
 
     async def run(self) -> None:
         """Send heartbeats, the first at once, until cancelled."""
-        async for _ in ticks(HEARTBEAT_PERIOD_S):
-            for link in self._links:
-                self._beat(link)
+        try:
+            async for _ in ticks(HEARTBEAT_PERIOD_S):
+                for link in self._links:
+                    self._beat(link)
+                self.access.expire()
+        finally:
+            self.files.close()
+            if self.parameters is not None:
+                self.parameters.close()
+
+    def set_limits(self, limits: LimitsConfig) -> None:
+        """What may be asked of the arm from now on."""
+        self._translation.limits = self.guidance.limits = limits
 
     # --- identity ---
 
@@ -114,12 +174,47 @@ class Component:
             )
         )
 
-    def _on_heartbeat(self, message: Message, _: MavlinkLink) -> None:
+    def _information(self) -> Message:
+        """COMPONENT_INFORMATION_BASIC."""
+        return mav.MAVLink_component_information_basic_message(
+            self._boot_ms,
+            CAPABILITIES,
+            0,
+            b"arm_companion",
+            b"continuum arm",
+            metadata.version("arm-companion").encode()[:23],
+            b"",
+            b"",
+        )
+
+    def _metadata(self) -> Message:
+        """COMPONENT_METADATA."""
+        where, crc = self._general
+        return mav.MAVLink_component_metadata_message(self._boot_ms, crc, where)
+
+    @property
+    def _boot_ms(self) -> int:
+        return round((self._clock.now() - self._started) * 1e3) & 0xFFFFFFFF
+
+    def _busy(self) -> str | None:
+        """Why the daemon must not end now."""
+        if self.active:
+            return "the arm is at work"
+        return "the vehicle is armed" if self._armed else None
+
+    def _on_heartbeat(self, message: Message, link: MavlinkLink) -> None:
+        self.access.heard(message, link)
+        if link.role == "autopilot":
+            self._follow(message)
+
+    def _follow(self, message: Message) -> None:
+        """Be a part of the system of the autopilot that we hear."""
         before = self._finder.system_id
-        if not self._follow_autopilot or not self._finder.heard(message, self._clock.now()):
+        if not self._finder.heard(message, self._clock.now()):
             return
+        self._armed = bool(message.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
         system = self._finder.system_id
-        if system == before:
+        if system == before or not self._follow_autopilot:
             return
         log.info("our system id is %d, as the autopilot's", system)
         for link in self._links:
@@ -132,41 +227,50 @@ class Component:
     def _is_self(self, message: Message, link: MavlinkLink) -> bool:
         return bool(message.get_srcSystem() == link.system_id and message.get_srcComponent() == link.component_id)
 
-    def _for_us(self, message: Message, link: MavlinkLink, *, only_ours_know: bool) -> bool:
-        """Whether a message with an address is for us; component 0 is everybody.
+    def is_for_us(self, message: Message, link: MavlinkLink, *, everybody: bool) -> bool:
+        """Whether a message with an address is for us.
 
-        What everybody may take is taken only if nobody else knows it.
+        Args:
+            message: it has target_system and target_component.
+            link: where it came in.
+            everybody: whether component 0, which is everybody of our system, means us too.
         """
-        everybody = message.target_component == 0 and only_ours_know
-        ours = everybody or message.target_component == link.component_id
+        ours = message.target_component == link.component_id or (everybody and message.target_component == 0)
         if message.target_system == link.system_id and ours and not self._is_self(message, link):
             return True
         self.counters.not_for_us += 1
         return False
 
     def _on_command(self, message: Message, link: MavlinkLink) -> None:
-        if not self._for_us(message, link, only_ours_know=is_ours(message.command)):
+        command = read_command(message, sender_of(message, link))
+        if not self.is_for_us(message, link, everybody=self._translation.names_us(command)):
             return
-        self.commands.handle(read_command(message), link)
+        self.commands.handle(command, link)
         if link.streams.take_asked(HEARTBEAT):
             self._beat(link)
 
-    def _on_target(self, message: Message, link: MavlinkLink) -> None:
-        if not self._for_us(message, link, only_ours_know=True):
-            return
-        try:
-            self._bar = self._read_target(message)
-        except CommandRejected as rejected:
-            self.counters.bad_targets += 1
-            now = self._clock.now()
-            if now - self._complained >= _COMPLAINT_PERIOD_S:  # targets stream: one word is enough
-                self._complained = now
-                self._speaker.say(Notice(Severity.WARNING, f"target refused: {rejected.reason}"), link)
+    def _on_cancel(self, message: Message, link: MavlinkLink) -> None:
+        if self.is_for_us(message, link, everybody=is_ours(message.command)):
+            self.commands.cancel(message.command, sender_of(message, link), link)
 
-    def _read_target(self, message: Message) -> Bar:
-        if not self.commands.may_command(message.get_srcSystem()):
-            raise CommandRejected(f"system {message.get_srcSystem()} may not command the arm")
-        return read_bar(message)
+    def _on_guidance(self, message: Message, link: MavlinkLink) -> None:
+        if self.is_for_us(message, link, everybody=True):
+            self.guidance.handle(message, link)
+
+    def _on_parameter(self, message: Message, link: MavlinkLink) -> None:
+        service = self.parameters
+        if service is not None and self.is_for_us(message, link, everybody=service.is_for_everybody(message)):
+            service.handle(message, link)
+
+    def _on_file_transfer(self, message: Message, link: MavlinkLink) -> None:
+        if self.is_for_us(message, link, everybody=False):
+            self.files.handle(message, link)
+
+    def _on_timesync(self, message: Message, link: MavlinkLink) -> None:
+        """A question has no time of the other side yet; an answer is the autopilot driver's."""
+        if message.tc1 == 0 and not self._is_self(message, link):
+            now = round(self._clock.now() * 1e9)
+            link.send(mav.MAVLink_timesync_message(now, message.ts1), Priority.NOW)  # waiting would spoil it
 
     def _on_ping(self, message: Message, link: MavlinkLink) -> None:
         """A ping to nobody in particular is a question; one with an address is somebody's answer."""

@@ -39,6 +39,15 @@ class Streams:
         period = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
         self._streams[id_] = _Stream(period, period, fixed)
 
+    def set_default(self, id_: int, rate_hz: float) -> None:
+        """Change the default rate of a message; who has asked for another one keeps it."""
+        stream = self._streams[id_]
+        period = 1.0 / rate_hz if rate_hz > 0.0 else 0.0
+        if stream.period_s == stream.default_s:
+            stream.period_s = period
+            stream.due = float("-inf")
+        stream.default_s = period
+
     def offered(self, id_: int) -> bool:
         """Whether the message can be sent at all."""
         return id_ in self._streams

@@ -5,16 +5,33 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final, TypeVar
 
+import numpy as np
+
 from arm_companion.clock import Clock
 from arm_companion.config.schema import RatesConfig
+from arm_companion.drivers.link_watch import LinkWatch
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
-from arm_companion.mission.facts import StatusReport, TendonState, WrenchReport, WrenchSource
+from arm_companion.drivers.mirrors import mirror_array, mirror_values
+from arm_companion.mission.facts import (
+    PayloadReport,
+    StatusReport,
+    StiffnessReport,
+    TendonState,
+    WrenchReport,
+    WrenchSource,
+)
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 
 STATUS: Final = mav.MAVLINK_MSG_ID_ARM_STATUS
 TENDONS: Final = mav.MAVLINK_MSG_ID_ARM_TENDONS
 WRENCH: Final = mav.MAVLINK_MSG_ID_ARM_REACTION_WRENCH
+
+STIFFNESS: Final = mav.MAVLINK_MSG_ID_ARM_STIFFNESS
+PAYLOAD: Final = mav.MAVLINK_MSG_ID_ARM_PAYLOAD
+VALUES: Final = mav.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
+ARRAY: Final = mav.MAVLINK_MSG_ID_DEBUG_FLOAT_ARRAY
+NODE: Final = mav.MAVLINK_MSG_ID_LINK_NODE_STATUS
 
 PER_MESSAGE: Final = 4
 """Tendons that fit into one ARM_TENDONS."""
@@ -23,6 +40,9 @@ _BEHAVIOURS: Final = {
     entry.name.removeprefix("ARM_BEHAVIOUR_"): value for value, entry in mav.enums["ARM_BEHAVIOUR"].items()
 }
 Number = TypeVar("Number", int, float)
+
+_UPPER: Final = np.triu_indices(6)
+_WELL_CONDITIONED: Final = 1e9
 
 _INT16_MAX: Final = 32_767
 _UINT16_MAX: Final = 65_535
@@ -54,10 +74,18 @@ class Telemetry:
     def __init__(self, links: Sequence[MavlinkLink], rates: RatesConfig, clock: Clock) -> None:
         self._links = links
         self._clock = clock
+        self.holder: tuple[int, int] = (0, 0)
+        """Who has primary control, for ARM_STATUS."""
+        self._nodes = {link.name: LinkWatch(link) for link in links}
         for link in links:
-            link.streams.offer(STATUS, rates.status_hz)
-            link.streams.offer(TENDONS, rates.tendons_hz)
-            link.streams.offer(WRENCH, rates.wrench_hz)
+            for id_, rate in _rates(rates, link):
+                link.streams.offer(id_, rate)
+
+    def set_rates(self, rates: RatesConfig) -> None:
+        """Other default rates, for who has not asked for his own."""
+        for link in self._links:
+            for id_, rate in _rates(rates, link):
+                link.streams.set_default(id_, rate)
 
     def publish(
         self,
@@ -66,6 +94,9 @@ class Telemetry:
         tendons: Sequence[TendonState],
         wrench: WrenchReport,
         goals: Sequence[float] | None = None,
+        *,
+        stiffness: StiffnessReport | None = None,
+        payload: PayloadReport | None = None,
     ) -> None:
         """Send whichever messages are due; called once a cycle.
 
@@ -75,11 +106,23 @@ class Telemetry:
             tendons: state of each tendon.
             wrench: predicted reaction wrench.
             goals: commanded displacement of each tendon, m; None when there is none.
+            stiffness: of the arm in its pose; None when the model has none.
+            payload: what it carries; None when nothing is estimated.
         """
         stamp = round(self._clock.unix(now) * 1e6)
-        self._offer(STATUS, now, lambda: iter((status_message(stamp, status, tendons, wrench),)))
+        boot_ms = int(now * 1e3) & 0xFFFFFFFF
+        self._offer(STATUS, now, lambda: iter((status_message(stamp, status, tendons, wrench, self.holder),)))
         self._offer(TENDONS, now, lambda: tendon_messages(stamp, tendons, goals))
         self._offer(WRENCH, now, lambda: iter((wrench_message(stamp, wrench),)))
+        if stiffness is not None:
+            self._offer(STIFFNESS, now, lambda: stiffness_messages(stamp, stiffness))
+        if payload is not None:
+            self._offer(PAYLOAD, now, lambda: iter((payload_message(stamp, payload),)))
+        self._offer(VALUES, now, lambda: mirror_values(boot_ms, status, tendons, wrench))
+        self._offer(ARRAY, now, lambda: iter((mirror_array(stamp, status, tendons, wrench),)))
+        for link in self._links:
+            if link.connected and link.streams.take_due(NODE, now):
+                link.send(self._nodes[link.name].message(stamp, now), Priority.BULK)
 
     def _offer(self, id_: int, now: float, make: Callable[[], Iterator[Message]]) -> None:
         """Make the messages once, if any link has them due, and send them there."""
@@ -90,7 +133,29 @@ class Telemetry:
                     link.send(message, Priority.BULK)
 
 
-def status_message(stamp: int, status: StatusReport, tendons: Sequence[TendonState], wrench: WrenchReport) -> Message:
+def _rates(rates: RatesConfig, link: MavlinkLink) -> Iterator[tuple[int, float]]:
+    """Ids with their default rates on a link."""
+    mirrors = rates.mirrors_hz if link.mirrors else 0.0
+    for id_, rate in (
+        (STATUS, rates.status_hz),
+        (TENDONS, rates.tendons_hz),
+        (WRENCH, rates.wrench_hz),
+        (STIFFNESS, rates.stiffness_hz),
+        (PAYLOAD, rates.payload_hz),
+        (VALUES, mirrors),
+        (ARRAY, mirrors),
+        (NODE, 0.0),
+    ):
+        yield id_, link.config.rates_hz.get(mav.mavlink_map[id_].msgname, rate)
+
+
+def status_message(
+    stamp: int,
+    status: StatusReport,
+    tendons: Sequence[TendonState],
+    wrench: WrenchReport,
+    holder: tuple[int, int] = (0, 0),
+) -> Message:
     """ARM_STATUS.
 
     Args:
@@ -98,6 +163,7 @@ def status_message(stamp: int, status: StatusReport, tendons: Sequence[TendonSta
         status: what the mission reports.
         tendons: they tell of the servos.
         wrench: its source tells of contact.
+        holder: system and component that have primary control; zeros: nobody.
     """
     flags, errors = status.flags | _SOURCE_FLAGS[wrench.source], status.error_bits
     if tendons and not any(t.silent for t in tendons):
@@ -123,6 +189,7 @@ def status_message(stamp: int, status: StatusReport, tendons: Sequence[TendonSta
         status.progress,
         mav.ARM_CALIBRATION_UNKNOWN,
         status.state.encode("ascii", errors="replace")[:20],
+        *holder,
     )
 
 
@@ -143,6 +210,42 @@ def wrench_message(stamp: int, wrench: WrenchReport) -> Message:
         wrench.residual,
         int(wrench.source),
         mav.ARM_VALIDITY_FORCE | mav.ARM_VALIDITY_TORQUE if wrench.valid else 0,
+    )
+
+
+def stiffness_messages(stamp: int, stiffness: StiffnessReport) -> Iterator[Message]:
+    """ARM_STIFFNESS: the compliance, and its inverse where there is one.
+
+    Args:
+        stamp: Unix time, us.
+        stiffness: the compliance' upper triangle.
+    """
+    entries = list(stiffness.compliance_b)
+    yield mav.MAVLink_arm_stiffness_message(stamp, entries, mav.ARM_MATRIX_COMPLIANCE)
+    C = np.zeros((6, 6))
+    C[_UPPER] = entries
+    C = C + np.triu(C, 1).T
+    # metres and radians do not compare: scaled to a unit diagonal, the matrix shows whether it can be inverted
+    scale = np.sqrt(np.clip(np.diag(C), 0.0, None))
+    if scale.min() > 0.0 and np.linalg.cond(C / np.outer(scale, scale)) < _WELL_CONDITIONED:
+        inverse = np.linalg.inv(C)
+        yield mav.MAVLink_arm_stiffness_message(stamp, [float(k) for k in inverse[_UPPER]], mav.ARM_MATRIX_STIFFNESS)
+
+
+def payload_message(stamp: int, payload: PayloadReport) -> Message:
+    """ARM_PAYLOAD.
+
+    Args:
+        stamp: Unix time, us.
+        payload: the estimate.
+    """
+    return mav.MAVLink_arm_payload_message(
+        stamp,
+        payload.mass,
+        payload.mass_sigma,
+        list(payload.centre_of_mass_b),
+        list(payload.centre_of_mass_sigma),
+        int(payload.valid),
     )
 
 

@@ -4,8 +4,10 @@ Frames: w world (NED), b body (FRD), a arm base. Quaternions are (w, x, y, z) an
 """
 
 import enum
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
+
+from arm_companion.record_codec import UNRECORDED
 
 Vec3: TypeAlias = tuple[float, float, float]
 Quaternion: TypeAlias = tuple[float, float, float, float]
@@ -295,5 +297,6 @@ class Commands:
     notices: tuple[Notice, ...]
     status: StatusReport
     wrench: WrenchReport
-    stiffness: StiffnessReport | None = None
+    # follows from what is recorded, and is large
+    stiffness: StiffnessReport | None = field(default=None, compare=False, metadata=UNRECORDED)
     payload: PayloadReport | None = None

@@ -73,6 +73,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         tuple(notices),
         status_report(situation, prediction),
         prediction.wrench,
+        prediction.stiffness,
     )
     return state, commands
 

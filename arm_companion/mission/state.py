@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
-from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, Vec3, WrenchReport
+from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
 from arm_companion.mission.motion import ZERO, Reference
 from arm_companion.record_codec import UNRECORDED
 
@@ -87,6 +87,7 @@ class Prediction:
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
     # where the next solve starts; it follows from what was recorded before, so it is not recorded itself
     start: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
+    stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
 @dataclass(frozen=True, slots=True)

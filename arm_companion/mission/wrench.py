@@ -13,7 +13,7 @@ from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
-from arm_companion.mission.facts import Vec3, WrenchReport, WrenchSource
+from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
@@ -50,6 +50,7 @@ def predict(s: Situation) -> Prediction:
         s.bend,
         _lean(s, solution),
         solution if holding else None,
+        _stiffness(s, solution),
     )
 
 
@@ -187,6 +188,20 @@ def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:
     north, east, _ = -np.linalg.solve(A, S_move @ move)
     # up and down the autopilot's own loop is stiff and integrates, and a wrap pushed hard there slides
     return float(north), float(east), 0.0
+
+
+def _stiffness(s: Situation, solution: ArmSolution | None) -> StiffnessReport | None:
+    """Tip compliance in body axes; None without a solution, or at a singular one."""
+    if solution is None:
+        return None
+    try:
+        C = solution.compliance
+    except ModelError:
+        return None
+    R = np.kron(np.eye(2), s.mount.rotation)
+    C = R @ C @ R.T
+    C = 0.5 * (C + C.T)
+    return StiffnessReport(tuple(float(c) for c in C[np.triu_indices(6)]))
 
 
 def _tip(s: Situation) -> Vec3:

@@ -326,7 +326,7 @@ def test_who_may_not_command_is_denied_and_who_may_is_not(fly: Callable[..., Non
         assert (ack.result, ack.target_system) == (mav.MAV_RESULT_DENIED, 255)
         assert "ABORT denied: system 255 may not command" in rig.words()
         assert rig.component.commands.counters.forbidden == 1
-        assert rig.component.counters.bad_targets == 1
+        assert rig.component.guidance.counters.bad_targets == 1
 
     fly(body, commanders=(245,))
 
@@ -513,7 +513,7 @@ def test_the_newest_target_is_taken_with_a_unit_axis(fly: Callable[..., None]) -
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"kind": 1}, "kind 1"),
+        ({"kind": 7}, "kind 7"),
         ({"frame": mav.MAV_FRAME_BODY_FRD}, "MAV_FRAME_LOCAL_NED"),
         ({"position": [NAN, 0.0, 0.0]}, "position"),
         ({"position": [1e6, 0.0, 0.0]}, "position"),
@@ -532,7 +532,7 @@ def test_an_impossible_target_is_refused_with_the_reason(
             rig.ground.send(target(**changes))
         await asyncio.sleep(0.01)
         assert rig.component.take() == ([], None)
-        assert rig.component.counters.bad_targets == 10
+        assert rig.component.guidance.counters.bad_targets == 10
         words = rig.words()
         assert reason in words.replace(" | ", "")
         assert words.count("target refused") == 1  # a stream of targets is not a stream of complaints

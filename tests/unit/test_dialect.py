@@ -50,6 +50,7 @@ def test_every_standard_message_has_the_standards_layout() -> None:
 @pytest.mark.parametrize(
     ("name", "id_", "crc_extra", "size"),
     [
+        ("LINK_NODE_STATUS", 8, 117, 36),
         ("COMMAND_CANCEL", 80, 14, 4),
         ("COMPONENT_INFORMATION_BASIC", 396, 50, 160),
         ("COMPONENT_METADATA", 397, 182, 108),
@@ -102,7 +103,7 @@ def test_every_physical_field_of_ours_has_a_unit() -> None:
 
 
 def test_commands_stand_in_their_block_in_order() -> None:
-    names = {value: entry.name for value, entry in mav.enums["MAV_CMD"].items() if 64000 <= value < 64010}
+    names = {value: entry.name for value, entry in mav.enums["MAV_CMD"].items() if 64000 <= value < 64011}
     expected = [
         "READY",
         "STOW",
@@ -114,6 +115,7 @@ def test_commands_stand_in_their_block_in_order() -> None:
         "CALIBRATE",
         "CLEAR_ERRORS",
         "FEEDFORWARD",
+        "CONTROL",
     ]
     assert names == {64000 + i: f"MAV_CMD_ARM_{name}" for i, name in enumerate(expected)}
     assert all(commands.name_of(64000 + i) == name for i, name in enumerate(expected))

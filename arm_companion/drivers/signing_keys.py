@@ -1,0 +1,103 @@
+"""Signing keys and time stamps on disk."""
+
+import asyncio
+import logging
+import stat
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from arm_companion.clock import Clock
+from arm_companion.config.schema import Config
+from arm_companion.drivers.mavlink_link import MavlinkLink
+from arm_companion.drivers.settings import state_directory, write_atomically
+from arm_companion.errors import ConfigError
+from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing
+
+log = logging.getLogger(__name__)
+
+KEEP_EVERY_S: Final = 10.0
+"""How often the time stamps are written; a restart begins as much later, so that none is used twice."""
+
+
+def read_key(path: Path) -> bytes:
+    """The signing key in a file: 32 bytes, or 64 hexadecimal digits.
+
+    Raises:
+        ConfigError: the file is missing, readable for others, or no key.
+    """
+    try:
+        mode = path.stat().st_mode
+        data = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"signing_key {path}: {error.strerror}") from None
+    if mode & (stat.S_IRWXG | stat.S_IRWXO):
+        raise ConfigError(f"signing_key {path}: others may use it (mode {stat.S_IMODE(mode):04o}); chmod 600 {path}")
+    if len(data) == KEY_LENGTH:
+        return data
+    try:
+        key = bytes.fromhex(data.decode("ascii").strip())
+    except ValueError:
+        key = b""
+    if len(key) != KEY_LENGTH:
+        raise ConfigError(f"signing_key {path}: neither {KEY_LENGTH} bytes nor {2 * KEY_LENGTH} hexadecimal digits")
+    return key
+
+
+class SigningKeys:
+    """Gives each link that has a key its signing, and keeps the time stamps.
+
+    Args:
+        config: which link has which key file, and where time stamps are kept.
+
+    Raises:
+        ConfigError: a key cannot be used.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._directory = state_directory(config)
+        self._kept: dict[Path, Signing] = {}
+        self._by_link: dict[str, Signing] = {}
+        for number, (name, link) in enumerate(config.links.items()):
+            if not link.signing_key:
+                continue
+            stamp = 0
+            if self._directory is None:
+                log.warning("link %s: signing time stamps are not kept: set mavlink.state_directory", name)
+            else:
+                stamp = _read_stamp(self._directory / f"signing-{name}")
+            signing = Signing(read_key(Path(link.signing_key)), number, stamp)
+            self._by_link[name] = signing
+            if self._directory is not None:
+                self._kept[self._directory / f"signing-{name}"] = signing
+
+    def secure(self, links: Sequence[MavlinkLink], clock: Clock) -> None:
+        """Sign on those links that have a key."""
+        for link in links:
+            if (signing := self._by_link.get(link.name)) is not None:
+                link.secure(signing, lambda: clock.unix(clock.now()))
+
+    async def run(self) -> None:
+        """Write the time stamps again and again, until cancelled. The disk is waited for in a thread."""
+        while True:
+            await asyncio.sleep(KEEP_EVERY_S)
+            if self._kept:
+                await asyncio.to_thread(self.keep)
+
+    def keep(self) -> None:
+        """Write the time stamps now."""
+        for file, signing in self._kept.items():
+            try:
+                write_atomically(file, str(signing.stamp).encode() + b"\n")
+            except OSError as error:
+                log.error("signing time stamp is not kept: %s", error)  # noqa: TRY400 - the error says it all
+
+
+def _read_stamp(file: Path) -> int:
+    try:
+        return int(file.read_text(encoding="ascii")) + int(2 * KEEP_EVERY_S * UNITS_PER_S)
+    except FileNotFoundError:
+        return 0
+    except (OSError, ValueError) as error:
+        log.warning("%s is left aside: %s", file, error)
+        return 0
