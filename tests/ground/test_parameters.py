@@ -88,8 +88,8 @@ def test_reading_and_writing_by_name(scripted: Any) -> None:
         assert (await scripted.arm.parameters.write("P3", 0.1)).value == pytest.approx(0.1)
 
     scripted.run(main)
-    assert service.values["COUNT"] == (INT32, 99)
-    assert service.values["P3"] == (REAL32, pytest.approx(0.1))
+    assert (service.values["COUNT"], service.values["P3"][0]) == ((INT32, 99), REAL32)
+    assert service.values["P3"][1] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
