@@ -22,6 +22,8 @@ from arm_companion.ground.reports import Status
 from arm_companion.ground.texts import Text
 
 _TARGET_S: Final = 1.5
+_FOLLOWS_S: Final = 2.0
+_STILL: Final = math.radians(1.0)
 _LEAVE: Final = 3
 """So many times Ctrl-C leaves an order that is under way."""
 
@@ -166,31 +168,43 @@ async def _jog(arguments: argparse.Namespace, arm: Arm) -> int:
 async def _jog_by_keys(arguments: argparse.Namespace, arm: Arm, status: Status) -> int:
     theta, delta = (value if math.isfinite(value) else 0.0 for value in (status.theta, status.delta))
     jog = Jog(theta, delta)
+    moved_at, warned = math.inf, False
     say(arguments, HELP)
     listener = asyncio.create_task(_repeat_texts(arguments, arm))
     try:
         async with interrupts() as stop, keyboard() as keys:
-            async for _ in ticks(PERIOD_S):
+            async for tick in ticks(PERIOD_S):
                 now = arm.status or status
                 while not keys.empty():
                     key = keys.get_nowait()
                     if key == "q":
                         stop.put_nowait(signal.SIGINT)
-                    jog = jog.press(key, now.theta, now.delta)
-                if not stop.empty() or now.state not in ("READY", "JOG"):
+                    if (after := jog.press(key, now.theta, now.delta)) != jog:
+                        jog, moved_at = after, tick.now
+                if not stop.empty() or not (now.state == "READY" or now.behaviour == "jog"):
                     break
                 await arm.send_set_point(jog.theta, jog.delta, WATCHDOG_S)
-                if arguments.json:
-                    tell(arguments, theta=jog.theta, delta=jog.delta, arm_theta=now.theta, arm_delta=now.delta)
-                else:
-                    asked = f"asked {math.degrees(jog.theta):6.1f} deg in {math.degrees(jog.delta):6.1f}"
-                    is_at = f"at {math.degrees(now.theta):6.1f} in {math.degrees(now.delta):6.1f}"
-                    print(f"\r{asked}   {is_at}   step {math.degrees(jog.step_rad):.1f} ", end="", flush=True)
+                _show_jog(arguments, jog, now)
+                if not warned and tick.now - moved_at > _FOLLOWS_S:
+                    warned = True
+                    if abs(now.goal_theta - theta) < _STILL and abs(now.theta - theta) < _STILL < abs(
+                        jog.theta - theta
+                    ):
+                        say(arguments, "\nthe arm does not follow: it takes no set-points now, or not ours")
     finally:
         listener.cancel()
     state = arm.status.state if arm.status else "unknown"
-    say(arguments, f"\njogging ended: the arm holds where it was asked to be, state {state}")
+    say(arguments, f"\njogging ended: the arm holds where it is, state {state}")
     return DONE
+
+
+def _show_jog(arguments: argparse.Namespace, jog: Jog, now: Status) -> None:
+    if arguments.json:
+        tell(arguments, theta=jog.theta, delta=jog.delta, arm_theta=now.theta, arm_delta=now.delta)
+        return
+    asked = f"asked {math.degrees(jog.theta):6.1f} deg in {math.degrees(jog.delta):6.1f}"
+    is_at = f"at {math.degrees(now.theta):6.1f} in {math.degrees(now.delta):6.1f}"
+    print(f"\r{asked}   {is_at}   step {math.degrees(jog.step_rad):.1f} ", end="", flush=True)
 
 
 async def _control(arguments: argparse.Namespace, arm: Arm) -> int:

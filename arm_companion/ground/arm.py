@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import AsyncIterator
 from typing import Any, Final, TypeVar, overload
 
-from arm_companion.clock import unix_now
 from arm_companion.ground.channel import SILENT_S, Address, ArmSilent, Channel
 from arm_companion.ground.commands import Commander, Progress
 from arm_companion.ground.parameters import ParameterClient
@@ -290,7 +289,7 @@ class Arm:
         """
         tip = [math.nan] * 3
         await self.channel.send(
-            mav.MAVLink_arm_setpoint_message, _stamp(), mav.ARM_SETPOINT_KIND_BEND, theta, delta, tip, timeout_s
+            mav.MAVLink_arm_setpoint_message, self._stamp(), mav.ARM_SETPOINT_KIND_BEND, theta, delta, tip, timeout_s
         )
 
     async def target_bar(self, position: Vector, axis: Vector, radius: float) -> None:
@@ -308,7 +307,7 @@ class Arm:
         unknown = [_UNKNOWN] * 4, [_UNKNOWN] * 6
         await self.channel.send(
             mav.MAVLink_arm_target_message,
-            *(_stamp(), kind, frame, list(position), list(axis), unknown[0], radius, unknown[1], _UNKNOWN),
+            *(self._stamp(), kind, frame, list(position), list(axis), unknown[0], radius, unknown[1], _UNKNOWN),
         )
 
     # Inside --------------------
@@ -340,6 +339,9 @@ class Arm:
     def _state(self) -> tuple[str, float]:
         return (self.status.state if self.status else "", self.age(Status))
 
+    def _stamp(self) -> int:
+        """Now in the arm's own clock, us, late by the link's latency; 0 before its first status.
 
-def _stamp() -> int:
-    return round(unix_now() * 1e6)
+        Our own clock would not do: the arm refuses what is too old, and neither machine need know the time.
+        """
+        return 0 if self.status is None else round((self.status.time + self.age(Status)) * 1e6)

@@ -38,6 +38,18 @@ def test_state_arrives_direct_and_private_messages_leave_direct(scripted: Any, m
     assert all(math.isnan(x) for x in sent.tip_position)
 
 
+def test_stamps_are_in_the_arms_own_clock(scripted: Any, make_status: Make) -> None:
+    async def main() -> None:
+        await asyncio.sleep(2.0)
+        await scripted.arm.send_set_point(0.1, 0.0)  # nothing is known of its clock
+        scripted.say(make_status(time_usec=77_000_000))
+        await asyncio.sleep(0.25)
+        await scripted.arm.target_bar((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), 0.02)
+
+    scripted.run(main)
+    assert [m.time_usec for m in scripted.received] == [0, 77_250_000]
+
+
 def test_behind_an_autopilot_both_ways_are_tunnels(scripted: Any, make_status: Make) -> None:
     scripted.through_autopilot = True
 
