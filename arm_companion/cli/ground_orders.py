@@ -24,6 +24,7 @@ from arm_companion.ground.texts import Text
 _TARGET_S: Final = 1.5
 _FOLLOWS_S: Final = 2.0
 _STILL: Final = math.radians(1.0)
+_STATUS_S: Final = 0.3
 _LEAVE: Final = 3
 """So many times Ctrl-C leaves an order that is under way."""
 
@@ -57,8 +58,10 @@ async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Await
         listener.cancel()
         task.cancel()  # does nothing to one that is done
         await asyncio.wait({task})
+    seconds = round(loop.time() - started, 3)
+    await _fresh_status(arm)
     state = arm.status.state if arm.status else ""
-    facts = {"action": arguments.action, "state": state, "seconds": round(loop.time() - started, 3)}
+    facts = {"action": arguments.action, "state": state, "seconds": seconds}
     if task.cancelled():
         say(arguments, f"left: the arm carries on ({state or 'state unknown'}). To abort: arm-companion ground abort")
         tell(arguments, result="left", reason="", **facts)
@@ -69,9 +72,17 @@ async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Await
         print(f"arm-companion ground: {failed}", file=sys.stderr)
         tell(arguments, result=failed.result, reason=failed.reason, **facts)
         return INTERRUPTED if presses else FAILED
-    say(arguments, f"{name} done in {facts['seconds']:.1f} s" + (f", state {state}" if state else ""))
+    say(arguments, f"{name} done in {seconds:.1f} s" + (f", state {state}" if state else ""))
     tell(arguments, result="accepted", reason="", **facts)
     return DONE
+
+
+async def _fresh_status(arm: Arm) -> None:
+    """Wait a moment for a status from after the answer: the newest may still tell of the state before."""
+    name = Status.MESSAGE
+    before = arm.channel.counters.get(name, 0)
+    with contextlib.suppress(ArmSilent):
+        await arm.channel.wait_for(lambda: arm.channel.counters.get(name, 0) > before, _STATUS_S, "")
 
 
 async def _until_done_or_left(
