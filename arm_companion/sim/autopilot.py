@@ -8,7 +8,7 @@ in `autopilot_flavours`. Everything random comes from the configured seed.
 
 import asyncio
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -25,7 +25,7 @@ from arm_companion.sim.autopilot_streams import StreamTable
 from arm_companion.sim.autopilot_telemetry import Battery, Telemetry
 from arm_companion.sim.estimator import Estimator
 from arm_companion.sim.flight_control import Airframe, Estimate, FlightController
-from arm_companion.sim.mavlink_router import Port, Router, RouterCounters
+from arm_companion.sim.mavlink_router import SYSTEM, Port, Router, RouterCounters
 from arm_companion.sim.ports import RigidState, RotorCommand
 from arm_companion.transport.base import Opener
 
@@ -127,6 +127,17 @@ class AutopilotStandIn:
     def fail(self) -> None:
         """An emergency: the vehicle sinks where it is and obeys nobody but the pilot."""
         self._modes.fail()
+
+    def mission_item(self, command: int, parameters: Sequence[float]) -> None:
+        """An item of a mission comes up: PX4 sends commands for others out to all of its system, ArduPilot does not.
+
+        Args:
+            command: MAV_CMD.
+            parameters: its first ones; the others are zero.
+        """
+        if self._flavour.is_px4:
+            numbers = (*parameters, *[0.0] * (7 - len(parameters)))
+            self._broadcast(mav.MAVLink_command_long_message(SYSTEM, 0, command, 0, *numbers))
 
     def reboot(self) -> None:
         """Power-cycle: rotors off, silence, then a boot with default streams and no routes."""

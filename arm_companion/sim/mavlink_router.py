@@ -6,6 +6,7 @@ bursts, because its forward buffer holds few frames.
 """
 
 import asyncio
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -39,6 +40,7 @@ class Port:
         self._transport: Transport | None = None
         self.routes: set[tuple[int, int]] = set()
         self.buffer_empty_at = 0.0  # loop time at which the forward buffer will have drained
+        self._forwarded: deque[bytes] = deque()
         self._codec = mav.MAVLink(None, SYSTEM, COMPONENT)
         self._codec.robust_parsing = True
 
@@ -65,6 +67,11 @@ class Port:
         """Send a frame as it is."""
         if self._transport is not None:
             self._transport.write(frame)
+
+    def pass_on_later(self, frame: bytes, delay_s: float) -> None:
+        """Send a frame as it is in `delay_s`; frames keep their order, which timers of one instant do not."""
+        self._forwarded.append(frame)
+        asyncio.get_running_loop().call_later(delay_s, lambda: self.pass_on(self._forwarded.popleft()))
 
     def reaches(self, system: int, component: int) -> bool:
         """Whether the addressee (component 0: any of the system) has been heard here."""
@@ -144,4 +151,4 @@ class Router:
                 port.buffer_empty_at = loop.time() + waiting + service_s
                 delay += waiting
             self.counters.forwarded += 1
-            loop.call_later(delay, port.pass_on, frame)
+            port.pass_on_later(frame, delay)

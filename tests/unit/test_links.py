@@ -1,0 +1,320 @@
+"""Links by their configuration: bandwidth, signing, forwarding, keys on disk, and what their counters tell."""
+
+import asyncio
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import AsyncIterator, Callable, Coroutine
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
+from arm_companion.config import Config
+from arm_companion.config.schema import LinkConfig, MavlinkConfig, VehicleConfig
+from arm_companion.drivers.forwarding import Forwarding
+from arm_companion.drivers.link_watch import LinkWatch
+from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.drivers.signing_keys import SigningKeys, read_key
+from arm_companion.errors import ConfigError
+from arm_companion.mission.facts import Notice, Severity
+from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.signing import Signing, stamp_at
+from tests.conftest import MavlinkPeer
+from tests.unit.component_rig import GCS, ServiceRig, serve
+
+KEY = bytes(range(32))
+VEHICLE = VehicleConfig(system_id=1)
+
+
+def ping(number: int, to: tuple[int, int] = (1, 1)) -> Any:
+    return mav.MAVLink_ping_message(number, number, *to)
+
+
+def sealed(peer: MavlinkPeer, key: bytes = KEY) -> None:
+    """Let a peer sign as of now."""
+    signing = Signing(key, 9)
+    loop = asyncio.get_running_loop()
+    peer.codec.seal = lambda frame: signing.sign(frame, SIMULATED_EPOCH_S + loop.time())
+
+
+# --- bandwidth ---
+
+
+def test_a_slow_line_carries_what_it_can_the_urgent_first_and_the_newest() -> None:
+    async def main() -> None:
+        peer = MavlinkPeer(255, 190)
+        config = LinkConfig("", bandwidth_bytes_per_s=1000.0)
+        link = MavlinkLink("slow", "ground", peer.pipe.opener(0), VEHICLE, config=config)
+        await peer.open()
+        task = asyncio.create_task(link.run())
+        await asyncio.sleep(0.01)
+        for i in range(100):
+            link.send(ping(i), Priority.BULK)
+        link.send(GCS)
+        start = asyncio.get_running_loop().time()
+        await asyncio.sleep(0.5)
+        sizes = [len(m.get_msgbuf()) for m in peer.received]
+        assert sum(sizes) == pytest.approx(500, abs=60)
+        assert peer.received[1].get_type() == "HEARTBEAT"
+        await asyncio.sleep(2.0)
+        numbers = [m.seq for m in peer.all("PING")]
+        assert numbers == [0, *range(68, 100)]
+        assert link.counters.crowded_out == 67
+        assert asyncio.get_running_loop().time() - start > 1.0
+        status = LinkWatch(link).message(10**6, asyncio.get_running_loop().time())
+        assert (status.messages_sent, status.tx_overflows) == (34, 67)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+    run_simulated(main())
+
+
+@pytest.mark.parametrize(("url", "expected"), [("serial:/dev/ttyX:57600", 5760.0), ("udpin:127.0.0.1:1", 0.0)])
+def test_a_serial_line_limits_itself(url: str, expected: float) -> None:
+    async def nothing(_: Any) -> Any: ...
+
+    assert MavlinkLink("x", "ground", nothing, VEHICLE, config=LinkConfig(url))._bandwidth == expected
+
+
+def test_rates_of_a_link_are_checked() -> None:
+    with pytest.raises(ConfigError, match="rates_hz names ARM_NONSENSE"):
+        LinkConfig("", rates_hz={"ARM_NONSENSE": 1.0})
+
+
+def test_a_link_has_rates_of_its_own() -> None:
+    async def body(rig: ServiceRig) -> None:
+        for name, expected in (("autopilot", 50_000), ("ground", 500_000)):
+            (link,) = (link for link in rig.links if link.name == name)
+            assert link.streams.interval_us(mav.MAVLINK_MSG_ID_ARM_REACTION_WRENCH) == expected
+        assert rig.links[0].streams.interval_us(mav.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT) == 1_000_000
+        assert rig.links[1].streams.interval_us(mav.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT) == -1
+
+    serve(body, links={"ground": {"rates_hz": {"ARM_REACTION_WRENCH": 2.0}}})
+
+
+# --- signing ---
+
+
+def test_on_a_signing_link_only_who_has_the_key_is_heard() -> None:
+    async def body(rig: ServiceRig) -> None:
+        signing = Signing(KEY, 0)
+        rig.links[1].secure(signing, lambda: SIMULATED_EPOCH_S + asyncio.get_running_loop().time())
+        rig.ground.command(mav.MAV_CMD_ARM_ABORT)
+        sealed(rig.ground, bytes(32))
+        rig.ground.command(mav.MAV_CMD_ARM_ABORT)
+        await asyncio.sleep(0.05)
+        assert rig.component.take() == ([], None)
+        assert rig.links[1].codec.counters.refused == 2
+        sealed(rig.ground)
+        rig.ground.command(mav.MAV_CMD_ARM_ABORT)
+        await asyncio.sleep(0.05)
+        assert len(rig.component.take()[0]) == 1
+        rig.component.notify(Notice(Severity.INFO, "hello"))
+        await asyncio.sleep(0.05)
+        assert rig.ground.received[-1].get_signed()
+
+    serve(body)
+
+
+def test_a_recorded_command_cannot_be_played_again() -> None:
+    async def body(rig: ServiceRig) -> None:
+        signing = Signing(KEY, 0)
+        rig.links[1].secure(signing, lambda: SIMULATED_EPOCH_S + asyncio.get_running_loop().time())
+        sealed(rig.ground)
+        frame = rig.ground.codec.encode(mav.MAVLink_command_long_message(1, 192, mav.MAV_CMD_ARM_READY, 0, *[0.0] * 7))
+        for _ in range(5):
+            rig.ground.send_raw(frame)
+            await asyncio.sleep(5.0)
+        assert len(rig.component.take()[0]) == 1
+        assert rig.links[1].codec.counters.refused == 4
+
+    serve(body)
+
+
+@pytest.mark.parametrize(("policy", "moved"), [("listen", False), ("accept", True)])
+def test_unsigned_peers_are_heard_or_obeyed_as_configured(policy: str, moved: bool) -> None:
+    async def body(rig: ServiceRig) -> None:
+        rig.links[1].secure(Signing(KEY), lambda: SIMULATED_EPOCH_S)
+        rig.ground.command(mav.MAV_CMD_ARM_READY)
+        rig.ground.command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 64001, 20_000)
+        rig.ground.send(mav.MAVLink_param_set_message(1, 192, b"PERCH_STANDOFF", 0.8, 9))
+        rig.ground.send(mav.MAVLink_timesync_message(0, 5))
+        await asyncio.sleep(0.05)
+        assert bool(rig.component.take()[0]) is moved
+        assert (rig.settings.config.perch.standoff_m == pytest.approx(0.8)) is moved
+        assert rig.ground.all("TIMESYNC")
+        assert ("the sender does not sign" in rig.words()) is not moved
+
+    serve(body, links={"ground": {"unsigned": policy}})
+
+
+def test_a_key_file_must_be_private_and_a_key(tmp_path: Path) -> None:
+    file = tmp_path / "key"
+    with pytest.raises(ConfigError, match="No such file"):
+        read_key(file)
+    file.write_bytes(KEY)
+    file.chmod(0o640)
+    with pytest.raises(ConfigError, match=r"mode 0640\); chmod 600"):
+        read_key(file)
+    file.chmod(0o600)
+    assert read_key(file) == KEY
+    file.write_text(KEY.hex() + "\n")
+    assert read_key(file) == KEY
+    for wrong in (b"", b"zz" * 32, KEY + KEY):
+        file.write_bytes(wrong)
+        with pytest.raises(ConfigError, match="neither 32 bytes"):
+            read_key(file)
+
+
+def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) -> None:
+    key = tmp_path / "key"
+    key.write_bytes(KEY)
+    key.chmod(0o600)
+    config = dataclasses.replace(
+        Config(),
+        links={"ground": LinkConfig("", signing_key=str(key)), "open": LinkConfig("")},
+        mavlink=MavlinkConfig(state_directory=str(tmp_path)),
+    )
+    later = stamp_at(SIMULATED_EPOCH_S + 1e6)
+
+    async def main() -> None:
+        first = SigningKeys(config)
+        first._by_link["ground"].stamp = later
+        first.keep()
+        second = SigningKeys(config)
+        peer = MavlinkPeer(255, 190)
+        link = MavlinkLink("ground", "ground", peer.pipe.opener(0), VEHICLE, config=config.links["ground"])
+        second.secure([link], Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S))
+        assert link.signing is not None
+        assert link.signing.stamp > later
+        (tmp_path / "signing-ground").write_text("rubbish")
+        assert SigningKeys(config)._by_link["ground"].stamp == 0
+
+    asyncio.run(main())
+
+
+# --- forwarding ---
+
+
+@contextlib.asynccontextmanager
+async def network(names: str, forward: str) -> AsyncIterator[tuple[list[MavlinkLink], list[MavlinkPeer], Forwarding]]:
+    """Links a, b, c, ... to systems 11, 12, 13, ..., of which some forward."""
+    peers = [MavlinkPeer(11 + i, 1) for i in range(len(names))]
+    links = [
+        MavlinkLink(name, "ground", peer.pipe.opener(0), VEHICLE, config=LinkConfig("", forward=name in forward))
+        for name, peer in zip(names, peers, strict=True)
+    ]
+    forwarding = Forwarding([link for link in links if link.config.forward])
+    for peer in peers:
+        await peer.open()
+    tasks = [asyncio.create_task(link.run()) for link in links]
+    await asyncio.sleep(0.01)
+    try:
+        yield links, peers, forwarding
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+Net = Callable[[list[MavlinkLink], list[MavlinkPeer], Forwarding], Coroutine[Any, Any, None]]
+
+
+def route(body: Net, names: str = "abc", forward: str = "abc") -> None:
+    async def main() -> None:
+        async with network(names, forward) as (links, peers, forwarding):
+            await body(links, peers, forwarding)
+
+    run_simulated(main())
+
+
+def senders(peer: MavlinkPeer, name: str) -> list[int]:
+    return [m.get_srcSystem() for m in peer.all(name)]
+
+
+def test_what_is_for_everybody_goes_everywhere_but_back() -> None:
+    async def body(_: Any, peers: list[MavlinkPeer], forwarding: Forwarding) -> None:
+        peers[0].send(GCS)
+        unknown = bytearray(peers[0].codec.encode(GCS))
+        unknown[7:10] = b"\x11\xee\x00"  # an id that we do not know
+        peers[0].send_raw(bytes(unknown))
+        await asyncio.sleep(0.1)
+        assert [senders(peer, "HEARTBEAT") for peer in peers] == [[], [11], [11]]
+        assert [peer.codec.counters.unknown for peer in peers] == [0, 1, 1]
+        assert forwarding.counters.frames == 4
+
+    route(body)
+
+
+def test_what_is_for_one_goes_where_he_was_heard_and_nowhere_else() -> None:
+    async def body(_: Any, peers: list[MavlinkPeer], forwarding: Forwarding) -> None:
+        peers[0].send(ping(1, (12, 1)))
+        await asyncio.sleep(0.1)
+        assert forwarding.counters.unrouted == 1
+        peers[1].send(GCS)
+        await asyncio.sleep(0.1)
+        for to in ((12, 1), (12, 0), (12, 7), (1, 192)):
+            peers[0].send(ping(2, to))
+        await asyncio.sleep(0.1)
+        assert [(m.target_system, m.target_component) for m in peers[1].all("PING")] == [(12, 1), (12, 0)]
+        assert peers[2].all("PING") == []
+
+    route(body)
+
+
+def test_frames_pass_unchanged_with_their_sequence_and_signature() -> None:
+    async def body(_: Any, peers: list[MavlinkPeer], __: Forwarding) -> None:
+        sealed(peers[0])
+        frames = []
+        for i in range(3):
+            frames.append(peers[0].codec.encode(ping(i, (0, 0))))
+            peers[0].send_raw(frames[-1])
+        await asyncio.sleep(0.1)
+        assert [bytes(m.get_msgbuf()) for m in peers[1].received] == frames
+
+    route(body)
+
+
+def test_links_that_do_not_forward_and_keys_and_echoes_stay_out() -> None:
+    async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], forwarding: Forwarding) -> None:
+        peers[0].send(mav.MAVLink_setup_signing_message(0, 0, list(KEY), 0))
+        peers[2].send(GCS)
+        peers[0].codec.system_id, peers[0].codec._sender.srcComponent = 1, 192
+        peers[0].send(GCS)  # our own heartbeat, by a loop in the network
+        await asyncio.sleep(0.1)
+        assert [peer.received for peer in peers] == [[], [], []]
+        assert forwarding.counters.echoes == 1
+        assert links[1].counters.forwarded == 0
+
+    route(body, forward="ab")
+
+
+def test_what_a_signing_link_refuses_is_not_forwarded() -> None:
+    async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], _: Forwarding) -> None:
+        links[0].secure(Signing(KEY), lambda: SIMULATED_EPOCH_S)
+        peers[0].send(GCS)
+        await asyncio.sleep(0.1)
+        assert peers[1].received == []
+        sealed(peers[0])
+        peers[0].send(GCS)
+        await asyncio.sleep(0.1)
+        assert senders(peers[1], "HEARTBEAT") == [11]
+
+    route(body)
+
+
+def test_a_flood_on_one_link_delays_no_other() -> None:
+    async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], _: Forwarding) -> None:
+        arrivals: list[float] = []
+        loop = asyncio.get_running_loop()
+        peers[2].transport.receiver = lambda _: arrivals.append(loop.time())  # type: ignore[union-attr]
+        for tick in range(100):
+            peers[0].send(*(ping(i, (12, 1)) for i in range(20)))
+            if tick % 10 == 0:
+                links[2].send(GCS)
+            await asyncio.sleep(0.01)
+        assert all(b - a == pytest.approx(0.1, abs=1e-6) for a, b in itertools.pairwise(arrivals))
+
+    route(body)
