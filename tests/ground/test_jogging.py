@@ -92,7 +92,7 @@ def test_it_ends_with_ctrl_c_and_when_the_arm_goes_another_way(
     make_status: Make,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
-    end: dict[str, float],
+    end: dict[str, Any],
     state: str,
 ) -> None:
     assert jog(scripted, make_status, monkeypatch, {}, **end) == 0
