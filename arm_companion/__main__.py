@@ -10,6 +10,7 @@ from arm_companion.errors import ArmError, ConfigError
 
 _COMMANDS = {
     "run": "the daemon: fly the arm",
+    "ground": "hear and command the arm from the ground",
     "sim": "fly a scenario in the simulated world with the real daemon",
     "model": "the arm's mechanics: one equilibrium, or the paper's experiments",
     "calibrate": "fit the model to measurements",
