@@ -70,6 +70,7 @@ _BEND: Final = (
     Parameter(3, "delta", -2.0 * math.pi, 2.0 * math.pi),
 )
 _OFFSET: Final = tuple(Parameter(i, axis, -1.0, 1.0) for i, axis in ((2, "x"), (3, "y"), (4, "z")))
+_TIP: Final = tuple(Parameter(i, axis, -10.0, 10.0) for i, axis in ((2, "x"), (3, "y"), (4, "z")))
 
 _NAMES: Final = {
     mav.MAV_CMD_ARM_READY: "READY",
@@ -142,9 +143,7 @@ def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
             kind = _JOG_KIND.read(command)
             if kind == JOG_BEND:
                 return (kind, *(p.read(command) for p in _BEND))
-            if kind == JOG_VEHICLE:
-                return (kind, *(p.read(command) for p in _OFFSET))
-            raise CommandRejected("jogging by tip position is not available")
+            return (kind, *(p.read(command) for p in (_OFFSET if kind == JOG_VEHICLE else _TIP)))
         case "CALIBRATE":
             return (_CALIBRATION_STEP.read(command),)
         case "FEEDFORWARD":

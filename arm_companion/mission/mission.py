@@ -1,7 +1,6 @@
 """The mission's step: a pure function from memory and facts to memory and commands."""
 
 import dataclasses
-import math
 
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
@@ -20,6 +19,7 @@ from arm_companion.mission.facts import (
     Severity,
     TensionEstimate,
 )
+from arm_companion.mission.jog import follow_stream, jog
 from arm_companion.mission.perch import GRIPPED, TABLE, TENSE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.situation import Parameters, Situation
@@ -27,8 +27,6 @@ from arm_companion.mission.state import Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.wrench import predict
 
-_JOG_BEND = 1
-_JOG_VEHICLE = 3
 _CLEAR_TIMEOUT_S = 6.0
 
 SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
@@ -58,6 +56,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
     situation = _yield_to_pilot(situation, notices)
     for request in facts.requests:
         situation = _obey(situation, request, answers, notices)
+    situation = situation.remembering(follow_stream(situation, notices))
     situation = _move_on(situation, answers, notices)
     recover = _begins_clearing(situation)
     situation = _finish_clearing(situation, answers)
@@ -122,7 +121,7 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
             raise CommandRejected(f"{name} is not possible in state {phase.name}")
         if (reason := row.refusal(s)) is not None:
             raise CommandRejected(reason)
-        jogged = _jog(s, request) if request.order is Order.JOG else s.state
+        jogged = jog(s, request) if request.order is Order.JOG else s.state
     except CommandRejected as rejected:
         again_later = TABLE.known(request.order)
         result = Result.TEMPORARILY_REJECTED if again_later else Result.DENIED
@@ -167,25 +166,6 @@ def _finish_clearing(s: Situation, answers: list[Answer]) -> Situation:
     else:
         return s
     return s.remembering(dataclasses.replace(s.state, running=None))
-
-
-def _jog(s: Situation, request: Request) -> State:
-    """The state with a jog's new goal.
-
-    Raises:
-        CommandRejected: kind, value or size does not fit.
-    """
-    kind, x, y, z = (*request.parameters, 0.0, 0.0, 0.0, 0.0)[:4]
-    if s.state.phase is Phase.PERCHED and kind == _JOG_VEHICLE:
-        if (size := math.hypot(x, y, z)) > s.config.perch.jog_max_m:
-            raise CommandRejected(f"a move of {size:.3f} m is over {s.config.perch.jog_max_m:g} m")
-        return dataclasses.replace(s.state, offset=(x, y, z))
-    if s.state.phase is Phase.READY and kind == _JOG_BEND:
-        theta, delta = x, y
-        if abs(theta) > s.config.limits.bend_max_rad:
-            raise CommandRejected(f"a bend of {theta:.2f} rad is over {s.config.limits.bend_max_rad:g} rad")
-        return dataclasses.replace(s.state, bend_goal=(theta * math.cos(delta), theta * math.sin(delta)))
-    raise CommandRejected(f"jog kind {kind:g} is not possible in state {s.state.phase.name}")
 
 
 def _move_on(s: Situation, answers: list[Answer], notices: list[Notice]) -> Situation:

@@ -106,6 +106,7 @@ class State:
     streaming: bool = False  # set-points go out
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
+    streamed: bool = False  # the goal comes from a stream of set-points
     pulls: tuple[float, ...] = ()  # m, tendon goals that belong to `bend`; empty: not found yet
     reference: Reference | None = None
     contact_w: Vec3 = ZERO  # m, vehicle reference when contact was found

@@ -254,7 +254,7 @@ def test_a_final_answer_that_got_lost_is_repeated_but_a_new_command_is_new(fly: 
         ("JOG", (1.0, NAN, 0.0), "param2 (theta) is not a number"),
         ("JOG", (1.0, 13.0, 0.0), "param2 (theta) = 13"),
         ("JOG", (1.0, 0.5, -7.0), "param3 (delta)"),
-        ("JOG", (2.0, 0.0, 0.0, 0.2), "tip position is not available"),
+        ("JOG", (2.0, 0.0, 0.0, 20.0), "z"),
         ("JOG", (3.0, 0.0, 0.0, NAN), "param4 (z) is not a number"),
         ("JOG", (3.0, 2.0, 0.0, 0.0), "param2 (x) = 2 is outside -1 to 1"),
     ],
