@@ -58,7 +58,6 @@ class EmulatedServo:
         motor: the horn's true motion, which no loss of power changes.
         lag_s: by how much its time, as `advance` counts it, is behind the world's clock; its own clock is not.
         silenced: its transmitter is broken: it obeys and does not answer.
-        temperature: degC.
     """
 
     def __init__(self, servo_id: int, baud: int, position: float, rng: random.Random) -> None:
@@ -76,7 +75,7 @@ class EmulatedServo:
         self._heard_at = 0.0
         self._strained_s = 0.0
         self._load = 0.0
-        self.temperature = AMBIENT_C + 5.0
+        self._temperature = AMBIENT_C + 5.0
         self._voltage = 12.0
         self._registered: tuple[int, bytes] | None = None
         self.poke(ct.ID, servo_id)
@@ -129,6 +128,10 @@ class EmulatedServo:
         self.values[ct.HARDWARE_ERROR_STATUS.address] |= bits
         if bits & self.values[ct.SHUTDOWN.address]:
             self._torque_off()
+
+    def warm(self, temperature: float) -> None:
+        """Bring it to a temperature, degC; from there it cools or warms as it would."""
+        self._temperature = temperature
 
     def set_power(self, *, on: bool) -> None:
         """Cut or restore the supply; it boots afresh, and forgets turns and RAM."""
@@ -248,14 +251,14 @@ class EmulatedServo:
         share = self.motor.torque / stall if on else 0.0
         self._load += (share - self._load) * min(dt / _LOAD_FILTER_S, 1.0)
         heat = _HEATING_K_PER_W * voltage * voltage * STALL_CURRENT_PER_V * share * share
-        self.temperature += (AMBIENT_C + 5.0 + heat - self.temperature) * dt / _COOLING_S
+        self._temperature += (AMBIENT_C + 5.0 + heat - self._temperature) * dt / _COOLING_S
         if not self.awake:
             return
         self._strained_s = self._strained_s + dt if abs(self._load) > _OVERLOAD_SHARE else 0.0
         if self._strained_s > _OVERLOAD_S:
             self.trip(HardwareError.OVERLOAD)
         v = self.values
-        if self.temperature > v[_TEMPERATURE_LIMIT]:
+        if self._temperature > v[_TEMPERATURE_LIMIT]:
             self.trip(HardwareError.OVERHEATING)
         if not v[_MIN_VOLTAGE_LIMIT] <= voltage / ct.VOLTAGE_UNIT_V <= v[_MAX_VOLTAGE_LIMIT]:
             self.trip(HardwareError.INPUT_VOLTAGE)
@@ -327,7 +330,7 @@ class EmulatedServo:
         load = (self._load + self._rng.gauss(0.0, LOAD_NOISE)) * ct.LOAD_FULL
         v[ct.PRESENT_LOAD.address] = min(max(round(load), -ct.LOAD_FULL), ct.LOAD_FULL)
         v[ct.PRESENT_VOLTAGE.address] = round(self._voltage / ct.VOLTAGE_UNIT_V)
-        v[ct.PRESENT_TEMPERATURE.address] = round(self.temperature)
+        v[ct.PRESENT_TEMPERATURE.address] = round(self._temperature)
         v[ct.VELOCITY_TRAJECTORY.address] = round(self._trajectory.speed * ct.TICK_RAD / ct.VELOCITY_UNIT_RAD_PER_S)
         v[ct.POSITION_TRAJECTORY.address] = round(self._trajectory.position)
         v[ct.MOVING.address] = int(self._moving())

@@ -8,7 +8,7 @@
 | its supply fails | `EmulatedServo.set_power`; of all: `ServoEmulator.set_power` |
 | brown-out, over-voltage | `brown_out`, `ServoEmulator.supply_v` |
 | its horn is stuck | `seize`, `set_free`; in time it shuts down with an overload |
-| it is hot | `heat`; over its limit it shuts down |
+| it is hot | `EmulatedServo.warm`; over its limit it shuts down |
 | a hardware error | `EmulatedServo.trip` |
 | it restarts | `EmulatedServo.reboot` |
 | the cable is out | `EmulatedBus.unplug` |
@@ -69,11 +69,6 @@ def set_free(servo: EmulatedServo) -> None:
     free = Motor(servo.motor.position)
     free.duty, free.torque = servo.motor.duty, servo.motor.torque
     servo.motor = free
-
-
-def heat(servo: EmulatedServo, temperature: float) -> None:
-    """Bring a servo to a temperature, degC; from there it cools as it would."""
-    servo.temperature = temperature
 
 
 async def brown_out(emulator: ServoEmulator, volts: float, seconds: float) -> None:

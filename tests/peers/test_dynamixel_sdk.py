@@ -19,7 +19,7 @@ from arm_companion.protocol.dynamixel import StatusError
 from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_device import BOOT_S
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
-from arm_companion.sim.servo_faults import ByteDelay, heat, seize
+from arm_companion.sim.servo_faults import ByteDelay, seize
 
 pytestmark = pytest.mark.realtime
 CONFIG = ServosConfig()
@@ -291,7 +291,7 @@ def test_overheating_and_a_stuck_horn_let_go_and_alert(play: Play) -> None:
     def talk(client: Client) -> None:
         for servo in (1, 2):
             assert client.write(servo, ct.TORQUE_ENABLE, 1) == 0
-        heat(client.emulator[1], 80.0)
+        client.emulator[1].warm(80.0)
         seize(client.emulator[2])
         assert client.write(2, ct.GOAL_POSITION, 4000) & 0x7F == 0
         client.wait_for(lambda: client.read(1, ct.TORQUE_ENABLE) == 0)

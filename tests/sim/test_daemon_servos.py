@@ -13,23 +13,10 @@ from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
-from arm_companion.recorder import Record
+from arm_companion.recorder import MemoryRecorder
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.memory import MemoryPipe
-
-
-class MemoryRecorder:
-    """Keeps the records."""
-
-    def __init__(self) -> None:
-        self.records: list[Record] = []
-
-    def put(self, record: Record) -> None:
-        self.records.append(record)
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 class Field:

@@ -18,7 +18,7 @@ from arm_companion.protocol.dynamixel import StatusError
 from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_device import BOOT_S
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator
-from arm_companion.sim.servo_faults import ByteDelay, heat, seize, set_free
+from arm_companion.sim.servo_faults import ByteDelay, seize, set_free
 from arm_companion.sim.servo_motion import FRICTION, Trajectory
 from arm_companion.transport.base import Transport
 from arm_companion.transport.memory import MemoryPipe
@@ -213,7 +213,7 @@ def test_a_seized_horn_strains_without_turning_until_it_shuts_down(master: Maste
 
 def test_heat_above_the_limit_lets_go_and_goes_away_by_itself(master: Master) -> None:
     master.set(1, ct.TORQUE_ENABLE, 1)
-    heat(master.emulator[1], 73.0)
+    master.emulator[1].warm(73.0)
     master.wait(0.02)
     assert master.emulator[1].peek(ct.HARDWARE_ERROR_STATUS) == HardwareError.OVERHEATING
     assert master.emulator[1].peek(ct.TORQUE_ENABLE) == 0

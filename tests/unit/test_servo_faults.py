@@ -178,7 +178,7 @@ def test_a_stuck_horn_ends_in_an_overload_seen_in_the_same_cycle() -> None:
 
 def test_a_servo_that_overheats_shuts_down_and_comes_back_only_when_it_has_cooled() -> None:
     async def play(arm: Arm) -> None:
-        servo_faults.heat(arm.emulator[1], 75.0)
+        arm.emulator[1].warm(75.0)
         await arm.run(0.1, HOME + 50, until=lambda: arm.faults() == {1: HardwareError.OVERHEATING})
         assert arm.states[0].temperature > 70.0
         with pytest.raises(ExceptionGroup, match="recover: 1 of the servos"):
@@ -186,7 +186,7 @@ def test_a_servo_that_overheats_shuts_down_and_comes_back_only_when_it_has_coole
         await arm.run(1.0, HOME + 50)
         assert 1 in arm.faults(), "still too hot"
         assert arm.at(HOME + 50, ALL - {1})
-        servo_faults.heat(arm.emulator[1], 40.0)
+        arm.emulator[1].warm(40.0)
         await arm.meanwhile(arm.bus.recover(), HOME + 50)
         await arm.run(2.0, HOME + 50)
         assert arm.faults() == {}
