@@ -17,6 +17,7 @@ from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.forwarding import Forwarding
+from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_telemetry import ServoTelemetry
@@ -99,13 +100,14 @@ class Daemon:
             MavlinkLink(name, link.role, openers.links[name], config.vehicle, config=link)
             for name, link in config.links.items()
         ]
-        self._keys = SigningKeys(config)
+        self._keeper = Keeper()
+        self._keys = SigningKeys(config, self._keeper)
         self._keys.secure(self._links, clock)
         self._forwarding = Forwarding([link for link in self._links if link.config.forward])
         (autopilot_link,) = (link for link in self._links if link.role == "autopilot")
         self._timesync = Timesync(autopilot_link, clock)
         self._autopilot = Autopilot(autopilot_link, config.vehicle, self._timesync)
-        self._settings = Settings(config, state_directory(config))
+        self._settings = Settings(config, state_directory(config), self._keeper)
         self._settings.stowed, self._settings.apply = self._why_not_stowed, self._apply
         self._component = Component(
             self._links,
@@ -157,7 +159,6 @@ class Daemon:
                 self._timesync.run,
                 self.vehicle_check.run,
                 self._component.run,
-                self._settings.run,
                 self._keys.run,
                 self._bus.run,
                 self._cycles,
@@ -176,8 +177,8 @@ class Daemon:
                 self._calibrated.close()
                 for link in self._links:
                     link.close()
-                self._settings.close()
                 self._keys.keep()
+                self._keeper.close()
                 self._recorder.close()
 
     async def _prepare_model(self) -> None:

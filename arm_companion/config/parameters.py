@@ -6,6 +6,7 @@ characters, in one order, while the daemon runs.
 
 import dataclasses
 import enum
+import functools
 import typing
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -52,7 +53,7 @@ class Parameter:
     @property
     def whole(self) -> bool:
         """Whether its values are whole numbers."""
-        hint = typing.get_type_hints(_section(self.section))[self.key]
+        hint = _hints(_section(self.section))[self.key]
         return int in (hint, *typing.get_args(hint))
 
     def read(self, config: Config) -> float:
@@ -80,8 +81,14 @@ class Parameter:
         return dataclasses.replace(config, **{self.section: dataclasses.replace(section, **{self.key: new})})
 
 
+@functools.cache
 def _section(name: str) -> Any:
     return typing.get_type_hints(Config)[name]
+
+
+@functools.cache
+def _hints(section: Any) -> dict[str, Any]:
+    return typing.get_type_hints(section)
 
 
 def _table() -> tuple[Parameter, ...]:

@@ -4,17 +4,16 @@ The file holds only what was changed, by the option's path, so that everything e
 say. It is written beside itself and moved into place: a power cut leaves the old file or the new one.
 """
 
-import asyncio
-import contextlib
 import json
 import logging
 import math
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 from arm_companion.config.parameters import PARAMETERS, Parameter, When, overlay
 from arm_companion.config.schema import Config
+from arm_companion.drivers.keeper import Keeper
 from arm_companion.errors import CommandRejected, ConfigError
 
 log = logging.getLogger(__name__)
@@ -28,20 +27,21 @@ class Settings:
     Args:
         config: as the daemon was started with.
         directory: where changes are kept; None keeps none.
+        keeper: writes them.
 
     Attributes:
         stowed: says why the arm is not stowed; None when it is. The composition root sets it.
         apply: takes a configuration that is in force from now on. The composition root sets it.
     """
 
-    def __init__(self, config: Config, directory: Path | None = None) -> None:
+    def __init__(self, config: Config, directory: Path | None = None, keeper: Keeper | None = None) -> None:
         self.config = config
         self.stowed: Callable[[], str | None] = lambda: None
         self.apply: Callable[[Config], None] = lambda _: None
         self._next = config  # with what waits for a restart
         self._file = None if directory is None else directory / FILE
         self._changed = read_changes(directory)
-        self._unsaved = asyncio.Event()
+        self._keeper = keeper
 
     def value(self, parameter: Parameter) -> float:
         """What was set last, in force or not yet."""
@@ -67,24 +67,12 @@ class Settings:
         log.info("%s = %.7g (%s)", parameter.path, parameter.read(changed), parameter.when.value)
         self._next = changed
         self._changed[parameter.path] = parameter.read(changed)
-        self._unsaved.set()
+        if self._file is not None and self._keeper is not None:
+            changes = json.dumps(dict(sorted(self._changed.items())), indent=1)
+            self._keeper.put(self._file, changes.encode() + b"\n")
         if live is not None:
             self.config = live
             self.apply(live)
-
-    async def run(self) -> None:
-        """Write changes to disk as they come, until cancelled. The disk is waited for in a thread."""
-        while True:
-            await self._unsaved.wait()
-            self._unsaved.clear()
-            if self._file is not None:
-                await asyncio.to_thread(_store, self._file, dict(self._changed))
-
-    def close(self) -> None:
-        """Write what has not been written yet."""
-        if self._unsaved.is_set() and self._file is not None:
-            self._unsaved.clear()
-            _store(self._file, self._changed)
 
 
 def state_directory(config: Config) -> Path | None:
@@ -116,35 +104,3 @@ def read_changes(directory: Path | None) -> dict[str, float]:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         log.warning("%s is left aside: %s", directory / FILE, error)
         return {}
-
-
-def _store(file: Path, values: Mapping[str, float]) -> None:
-    try:
-        write_atomically(file, json.dumps(dict(sorted(values.items())), indent=1).encode() + b"\n")
-    except OSError as error:
-        log.error("parameters are not kept: %s", error)  # noqa: TRY400 - the error says it all
-
-
-def write_atomically(file: Path, data: bytes) -> None:
-    """Replace a file's content so that a power cut leaves the old one or the new one.
-
-    Raises:
-        OSError: the disk does not take it; the old file is left then.
-    """
-    file.parent.mkdir(parents=True, exist_ok=True)
-    part = file.with_name(f".{file.name}.part")
-    try:
-        with part.open("wb") as stream:
-            stream.write(data)
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(file)
-    except OSError:
-        with contextlib.suppress(OSError):
-            part.unlink()
-        raise
-    folder = os.open(file.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

@@ -1,16 +1,16 @@
 """Signing keys and time stamps on disk."""
 
-import asyncio
 import logging
 import stat
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from arm_companion.clock import Clock
+from arm_companion.clock import Clock, ticks
 from arm_companion.config.schema import Config
+from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
-from arm_companion.drivers.settings import state_directory, write_atomically
+from arm_companion.drivers.settings import state_directory
 from arm_companion.errors import ConfigError
 from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing
 
@@ -49,12 +49,14 @@ class SigningKeys:
 
     Args:
         config: which link has which key file, and where time stamps are kept.
+        keeper: writes them.
 
     Raises:
         ConfigError: a key cannot be used.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, keeper: Keeper) -> None:
+        self._keeper = keeper
         self._directory = state_directory(config)
         self._kept: dict[Path, Signing] = {}
         self._by_link: dict[str, Signing] = {}
@@ -78,19 +80,14 @@ class SigningKeys:
                 link.secure(signing, lambda: clock.unix(clock.now()))
 
     async def run(self) -> None:
-        """Write the time stamps again and again, until cancelled. The disk is waited for in a thread."""
-        while True:
-            await asyncio.sleep(KEEP_EVERY_S)
-            if self._kept:
-                await asyncio.to_thread(self.keep)
+        """Keep the time stamps again and again, until cancelled."""
+        async for _ in ticks(KEEP_EVERY_S):
+            self.keep()
 
     def keep(self) -> None:
         """Write the time stamps now."""
         for file, signing in self._kept.items():
-            try:
-                write_atomically(file, str(signing.stamp).encode() + b"\n")
-            except OSError as error:
-                log.error("signing time stamp is not kept: %s", error)  # noqa: TRY400 - the error says it all
+            self._keeper.put(file, str(signing.stamp).encode() + b"\n")
 
 
 def _read_stamp(file: Path) -> int:

@@ -83,12 +83,12 @@ def _layout(cls: Any) -> _Layout:
         starts.append(at)
         at += length
     slots = tuple((starts[order], cls.array_lengths[order] if cls.lengths[order] > 1 else 0) for order in cls.orders)
-    target = (_place(cls, "target_system"), _place(cls, "target_component"))
+    target = (place_of(cls, "target_system"), place_of(cls, "target_component"))
     return _Layout(cls, bytes([cls.crc_extra]), cls.unpacker.size, cls.unpacker.unpack, slots, target)
 
 
-def _place(cls: Any, name: str) -> int:
-    """Offset of a field in the payload; -1 when the message has none of that name."""
+def place_of(cls: Any, name: str) -> int:
+    """Offset of a field in the payload of a generated message class; -1 when it has none of that name."""
     at = 0
     for field_name, entries in zip(cls.ordered_fieldnames, cls.array_lengths, strict=True):
         if field_name == name:

@@ -1,6 +1,8 @@
 """UDP sockets as byte pipes: one that calls out, one that waits and answers who speaks to it, one that broadcasts."""
 
 import asyncio
+import socket
+from collections.abc import Callable
 from typing import Any, cast
 
 from arm_companion.errors import LinkError
@@ -14,18 +16,25 @@ MOST_PEERS = 8
 PEER_SILENCE_S = 10.0
 """A peer that has been silent for this long is not written to any more, unless it is the only one."""
 
+_MOST_AT_ONCE = 64
+_LARGEST = 65_536
+
 
 class UdpTransport(asyncio.DatagramProtocol):
     """One open socket.
 
     Args:
+        plain: the socket below asyncio's transport.
         receiver: takes every datagram.
         learns: whether `write` goes to everybody who has spoken lately (a waiting socket), so that it has nobody
             to send to before somebody has. A calling socket is connected and has only one.
         broadcast: where `write` goes instead.
     """
 
-    def __init__(self, receiver: Receiver, *, learns: bool = False, broadcast: Address | None = None) -> None:
+    def __init__(
+        self, plain: socket.socket, receiver: Receiver, *, learns: bool = False, broadcast: Address | None = None
+    ) -> None:
+        self._plain = plain
         self._receiver = receiver
         self._learns = learns
         self._broadcast = broadcast
@@ -42,7 +51,17 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._socket = cast("asyncio.DatagramTransport", transport)
 
     def datagram_received(self, data: bytes, addr: Address) -> None:
-        """Hand a datagram on and remember who sent it."""
+        """Hand on a datagram, and those behind it: asyncio would go round its loop for each."""
+        self._take(data, addr)
+        for _ in range(_MOST_AT_ONCE):
+            try:
+                more, sender = self._plain.recvfrom(_LARGEST)
+            except OSError:  # nothing more; or an error, which the next wait tells
+                return
+            self._take(more, sender)
+
+    def _take(self, data: bytes, addr: Address) -> None:
+        """Remember who sent a datagram, and hand it on."""
         if self._learns:
             self._remember(addr)
         self._receiver(data)
@@ -109,14 +128,11 @@ def udp_in(host: str, port: int) -> Opener:
     """An `Opener` for a socket bound to host and port, that sends to everybody who has spoken to it lately."""
 
     async def open_socket(receiver: Receiver) -> UdpTransport:
-        loop = asyncio.get_running_loop()
         try:
-            _, pipe = await loop.create_datagram_endpoint(
-                lambda: UdpTransport(receiver, learns=True), local_addr=(host, port)
-            )
+            plain, address = await _socket(host, port)
+            return await _start(plain, lambda: plain.bind(address), UdpTransport(plain, receiver, learns=True))
         except OSError as error:
             raise LinkError(f"cannot listen on udp {host}:{port}: {error}") from error
-        return pipe
 
     return open_socket
 
@@ -125,14 +141,11 @@ def udp_out(host: str, port: int) -> Opener:
     """An `Opener` for a socket that sends to host and port and hears only them."""
 
     async def open_socket(receiver: Receiver) -> UdpTransport:
-        loop = asyncio.get_running_loop()
         try:
-            _, pipe = await loop.create_datagram_endpoint(
-                lambda: UdpTransport(receiver, learns=False), remote_addr=(host, port)
-            )
+            plain, address = await _socket(host, port)
+            return await _start(plain, lambda: plain.connect(address), UdpTransport(plain, receiver))
         except OSError as error:
             raise LinkError(f"cannot reach udp {host}:{port}: {error}") from error
-        return pipe
 
     return open_socket
 
@@ -146,15 +159,35 @@ def udp_broadcast(host: str, port: int) -> Opener:
     """
 
     async def open_socket(receiver: Receiver) -> UdpTransport:
-        loop = asyncio.get_running_loop()
         try:
-            _, pipe = await loop.create_datagram_endpoint(
-                lambda: UdpTransport(receiver, broadcast=(host, port)),
-                local_addr=("0.0.0.0", 0),  # noqa: S104 - answers come over whichever network they come
-                allow_broadcast=True,
-            )
+            plain, address = await _socket(host, port)
+
+            def prepare() -> None:
+                plain.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+                plain.bind(("", 0))  # answers come over whichever network they come
+
+            return await _start(plain, prepare, UdpTransport(plain, receiver, broadcast=address))
         except OSError as error:
             raise LinkError(f"cannot broadcast to udp {host}:{port}: {error}") from error
-        return pipe
 
     return open_socket
+
+
+async def _socket(host: str, port: int) -> tuple[socket.socket, Address]:
+    """A socket that does not wait, of the family of the first address of `host`, and that address."""
+    found = await asyncio.get_running_loop().getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    family, kind, protocol, _, address = found[0]
+    plain = socket.socket(family, kind, protocol)
+    plain.setblocking(False)
+    return plain, address
+
+
+async def _start(plain: socket.socket, prepare: Callable[[], None], pipe: UdpTransport) -> UdpTransport:
+    """Hand a socket to asyncio once it is prepared; one that cannot be is closed."""
+    try:
+        prepare()
+        await asyncio.get_running_loop().create_datagram_endpoint(lambda: pipe, sock=plain)
+    except OSError:
+        plain.close()
+        raise
+    return pipe

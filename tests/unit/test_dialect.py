@@ -18,6 +18,7 @@ from arm_companion.drivers import commands
 from arm_companion.mission.facts import WrenchSource
 from arm_companion.mission.state import Phase
 from arm_companion.protocol.dialect import XML, mav
+from arm_companion.protocol.dialect.document import document
 
 OURS = range(64000, 64008)
 TREE = ET.parse(XML)
@@ -200,3 +201,18 @@ def test_a_missing_build_is_explained(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_generator_names_no_folder() -> None:
     code = io.StringIO(Path(mav.__file__).read_text(encoding="utf-8"))
     assert "arm_companion.xml,common.xml" in "".join(next(code) for _ in range(8))
+
+
+def test_the_page_about_the_dialect_is_current() -> None:
+    page = (REPOSITORY / "docs" / "dialect.md").read_text(encoding="utf-8")
+    assert page == document(XML.read_text(encoding="utf-8")), "python -m arm_companion.protocol.dialect.document"
+
+
+def test_the_page_names_every_message_field_and_entry() -> None:
+    page = document(XML.read_text(encoding="utf-8"))
+    for element in TREE.iter():
+        if element.tag in ("message", "entry") and (element.get("name") or "") != "MAV_RESULT_CANCELLED":
+            assert f"{element.get('name')}" in page
+    wrench = page.split("### ARM_REACTION_WRENCH (64001)")[1].split("###")[0]
+    assert "| force | float[3] | 8 | N |" in wrench
+    assert "| source | uint8_t | 64 |" in wrench

@@ -14,6 +14,7 @@ from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config import Config
 from arm_companion.config.schema import LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.drivers.forwarding import Forwarding
+from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.link_watch import LinkWatch
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
 from arm_companion.drivers.signing_keys import SigningKeys, read_key
@@ -180,17 +181,19 @@ def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) ->
     later = stamp_at(SIMULATED_EPOCH_S + 1e6)
 
     async def main() -> None:
-        first = SigningKeys(config)
+        keeper = Keeper()
+        first = SigningKeys(config, keeper)
         first._by_link["ground"].stamp = later
         first.keep()
-        second = SigningKeys(config)
+        keeper.close()
+        second = SigningKeys(config, keeper)
         peer = MavlinkPeer(255, 190)
         link = MavlinkLink("ground", "ground", peer.pipe.opener(0), VEHICLE, config=config.links["ground"])
         second.secure([link], Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S))
         assert link.signing is not None
         assert link.signing.stamp > later
         (tmp_path / "signing-ground").write_text("rubbish")
-        assert SigningKeys(config)._by_link["ground"].stamp == 0
+        assert SigningKeys(config, keeper)._by_link["ground"].stamp == 0
 
     asyncio.run(main())
 

@@ -12,11 +12,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
 from arm_companion.config.parameters import NAME_LENGTH, PARAMETERS, Parameter, When, overlay
 from arm_companion.drivers.component_metadata import metadata_files
-from arm_companion.drivers.settings import FILE, Settings, read_changes, with_kept_changes, write_atomically
+from arm_companion.drivers.keeper import Keeper, write_atomically
+from arm_companion.drivers.settings import FILE, Settings, read_changes, with_kept_changes
 from arm_companion.errors import CommandRejected, ConfigError, ProtocolError
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.param_value import INT32, REAL32, from_bytes, from_float, to_bytes, to_float
@@ -119,19 +119,12 @@ def test_a_change_is_applied_when_its_time_has_come() -> None:
 def test_changes_survive_a_restart_and_the_file_wins_where_nothing_was_changed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async def main() -> None:
-        settings = Settings(Config(), tmp_path)
-        task = asyncio.create_task(settings.run())
-        settings.set(STANDOFF, 0.8)
-        settings.set(COMPID, 200.0)
-        async with asyncio.timeout(5.0):
-            while len(read_changes(tmp_path)) < 2:  # noqa: ASYNC110 - another thread writes
-                await asyncio.sleep(0.005)
-        task.cancel()
-        settings.set(WRENCH, 5.0)
-        settings.close()
-
-    asyncio.run(main())
+    keeper = Keeper()
+    settings = Settings(Config(), tmp_path, keeper)
+    settings.set(STANDOFF, 0.8)
+    settings.set(COMPID, 200.0)
+    settings.set(WRENCH, 5.0)
+    keeper.close()
     assert json.loads((tmp_path / FILE).read_text()) == {
         "perch.standoff_m": 0.8,
         "rates.wrench_hz": 5.0,
@@ -296,12 +289,12 @@ def test_the_metadata_describes_every_parameter() -> None:
         assert entry["type"] == ("Int32" if parameter.whole else "Float")
 
 
-def test_simulated_time_is_enough_for_a_save() -> None:
-    async def main() -> None:
-        settings = Settings(Config())
-        task = asyncio.create_task(settings.run())
-        settings.set(WRENCH, 5.0)
-        await asyncio.sleep(0.1)
-        task.cancel()
-
-    run_simulated(main())
+def test_a_disk_that_does_not_take_it_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").write_text("in the way")
+    keeper = Keeper()
+    keeper.put(tmp_path / "file" / FILE, b"x")
+    keeper.put(tmp_path / FILE, b"old")
+    keeper.put(tmp_path / FILE, b"new")
+    keeper.close()
+    assert "is not kept" in caplog.text
+    assert (tmp_path / FILE).read_bytes() == b"new"
