@@ -266,3 +266,19 @@ def test_a_wrench_over_its_limit_unloads_the_grip(parameters: Parameters, hoveri
     state, said = run(at(Phase.PERCHED, anchor=ANCHOR, prediction=prediction), hovering(), parameters)
     assert state.phase is Phase.UNLOAD
     assert any("13.0 N" in notice.text for c in said for notice in c.notices)
+
+
+def test_a_prediction_starts_from_the_last_and_says_what_a_first_one_would(
+    hovering: Hovering, parameters: Parameters
+) -> None:
+    first, _ = run(at(Phase.READY), hovering((0.5, 0.0)), parameters)
+    facts = hovering((0.505, 0.0))
+    warm, _ = run(first, facts, parameters, 0.1)
+    alone, _ = run(at(Phase.READY), facts, parameters)
+    assert warm.prediction is not None
+    assert alone.prediction is not None
+    assert warm.prediction.free is not None
+    assert alone.prediction.free is not None
+    assert warm.prediction.free.iterations < alone.prediction.free.iterations
+    assert warm.prediction.tip_a == pytest.approx(alone.prediction.tip_a, abs=1e-7)
+    assert warm.prediction.wrench.force_b == pytest.approx(alone.prediction.wrench.force_b, abs=1e-6)
