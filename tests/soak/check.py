@@ -64,8 +64,8 @@ class Defects:
         return max(self.moment, self.tip, self.tendon, self.support)
 
 
-def defects(asked: Asked, solution: ArmSolution) -> Defects:
-    """Every law that the answer must obey."""
+def defects(asked: Asked, solution: ArmSolution, pieces: int = PIECES) -> Defects:
+    """Every law that the answer must obey; sharper bends take more `pieces`."""
     P, g, s_end = asked.parameters, asked.gravity, solution.arc_length
     N0, M0 = solution.base_wrench[:3], solution.base_wrench[3:]
     longer = np.zeros(P.n)
@@ -76,11 +76,11 @@ def defects(asked: Asked, solution: ArmSolution) -> Defects:
         length = min(segment.L, s_end - before)
         if length <= 1e-12:
             break
-        edges = before + np.linspace(0, length, PIECES + 1)
-        h = length / PIECES
+        edges = before + np.linspace(0, length, pieces + 1)
+        h = length / pieces
         R, p = solution.detail.sections(edges)
         inner = (edges[:-1, None] + 0.5 * h * (x + 1)).ravel()
-        at = solution.detail.sections(inner)[1].reshape(PIECES, FINE, 3)
+        at = solution.detail.sections(inner)[1].reshape(pieces, FINE, 3)
         piece = segment.line_mass * 0.5 * h * np.einsum("f,kfi->ki", w, at)
         first_at = first + np.vstack((np.zeros(3), np.cumsum(piece, axis=0)))  # of the mass before every edge
         n = N0 - np.outer(mass + segment.line_mass * (edges - before), g)
