@@ -1,6 +1,7 @@
 """The composition root: byte pipes and a clock in, the running daemon out."""
 
 import asyncio
+import contextlib
 import dataclasses
 import logging
 from collections.abc import Mapping
@@ -27,7 +28,7 @@ from arm_companion.drivers.standard_services import Power
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
-from arm_companion.errors import ConfigError, DeviceFault
+from arm_companion.errors import ConfigError, DeviceFault, ModelError
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.situation import Parameters
@@ -192,7 +193,8 @@ class Daemon:
         def load() -> RodModel:
             compiled.load(compiling=False)
             fast = RodModel(model.parameters, fast=True)
-            fast.free(model.parameters.T0 * 0.0, (0.0, 0.0, 0.0))  # builds its tables
+            with contextlib.suppress(ModelError):
+                fast.free([0.0] * model.parameters.n, (0.0, 0.0, 0.0))  # builds its tables
             return fast
 
         try:

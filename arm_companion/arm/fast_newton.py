@@ -12,6 +12,7 @@ from numba import njit
 from numba.core.types import Tuple, boolean, float64, int64
 
 from arm_companion.arm.fast_equations import JIT, STATE, TABLES, Evaluated, M, Tables, V, evaluate, tangent, turned
+from arm_companion.arm.rod_equations import FAINT
 from arm_companion.arm.rod_solver import INDIFFERENT
 from arm_companion.geometry.arrays import Array
 
@@ -143,7 +144,7 @@ def imbalance(state: Evaluated, scale: float, tables: Tables) -> float:
     """See `Rod.imbalance`."""
     _, _, _, _, _, _, _, r, cos, sin, _, cable_w, _, _, weights, stiffness, node_chord = tables
     _, D, _, _, _, m, _, _, _, kappa, tension, _, _, near, length, _, _ = state
-    wrong, whole = 0.0, 1e-6 * scale
+    wrong, bend, load = 0.0, 0.0, 0.0
     for j in range(weights.size):
         x, y, z = kappa[0, j], kappa[1, j], kappa[2, j]
         cable_x, cable_y, cable_z = 0.0, 0.0, 0.0
@@ -168,8 +169,9 @@ def imbalance(state: Evaluated, scale: float, tables: Tables) -> float:
                 rest += cable_z * z
             give = weights[j] / stiffness[axis, j]
             wrong += give * rest * rest
-            whole += give * (own * own + moment * moment)
-    return wrong / whole
+            bend += give * own * own
+            load += give * moment * moment
+    return wrong / (load + min(bend, 3 * load) + FAINT * scale)
 
 
 _RESULT = Tuple((int64, int64, float64, float64, boolean, V, V, M, M, V))

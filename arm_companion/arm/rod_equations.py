@@ -36,9 +36,8 @@ _SYMMETRIC = np.array((0, 1, 3, 1, 2, 4, 3, 4, 5))  # where the six distinct blo
 _EYE = np.eye(3)
 # Skew matrix, row by row, of a turn given in (u_x, u_y, u_z): about y, -x and the tangent.
 _SKEW = np.zeros((3, 9))
-_SKEW[0, [2, 6]] = 1.0, -1.0
-_SKEW[1, [5, 7]] = 1.0, -1.0
-_SKEW[2, [3, 1]] = 1.0, -1.0
+_SKEW[[0, 0, 1, 1, 2, 2], [2, 6, 5, 7, 3, 1]] = (1.0, -1.0) * 3
+FAINT = 1e-4  # energy of loads, beside that of a radian's bend, under which `Rod.imbalance` does not tell them apart
 _TINY = 1e-300
 
 
@@ -380,8 +379,9 @@ class Rod:
         rest[:2] -= self.r * (self.directions.T @ (cables.near * pulled)) + drop * state.kappa[:2]
         rest[2] += self.r2 * state.kappa[2] * np.add.reduce(pulled, axis=0)
         give = self.mesh.weights / self.node_stiffness
-        whole = float(np.sum(give * (own * own + moment * moment))) + 1e-6 * self.moment_scale
-        return float(np.sum(give * (rest * rest))) / whole
+        bend, load = float(np.sum(give * own * own)), float(np.sum(give * moment * moment))
+        # a bend that tendons hold has energy enough to hide what small loads do
+        return float(np.sum(give * rest * rest)) / (load + min(bend, 3 * load) + FAINT * self.moment_scale)
 
 
 def _wrapped_cross(a: Array, b: Array) -> Array:

@@ -14,7 +14,7 @@ from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 from tests.unit.shooting import curvature, hat
 
-PIECES, STEPS = 40, 6  # per segment, and per piece
+PIECES, STEPS = 60, 4  # per segment, and per piece
 FINE = 8  # Gauss nodes on every piece, for the moment of the weight
 
 
@@ -64,8 +64,8 @@ class Defects:
         return max(self.moment, self.tip, self.tendon, self.support)
 
 
-def defects(asked: Asked, solution: ArmSolution) -> Defects:
-    """Every law that the answer must obey."""
+def defects(asked: Asked, solution: ArmSolution, pieces: int = PIECES) -> Defects:
+    """Every law that the answer must obey; sharper bends take more `pieces`."""
     P, g, s_end = asked.parameters, asked.gravity, solution.arc_length
     N0, M0 = solution.base_wrench[:3], solution.base_wrench[3:]
     longer = np.zeros(P.n)
@@ -76,25 +76,25 @@ def defects(asked: Asked, solution: ArmSolution) -> Defects:
         length = min(segment.L, s_end - before)
         if length <= 1e-12:
             break
-        edges = before + np.linspace(0, length, PIECES + 1)
-        h = length / PIECES
+        edges = before + np.linspace(0, length, pieces + 1)
+        h = length / pieces
         R, p = solution.detail.sections(edges)
         inner = (edges[:-1, None] + 0.5 * h * (x + 1)).ravel()
-        at = solution.detail.sections(inner)[1].reshape(PIECES, FINE, 3)
+        at = solution.detail.sections(inner)[1].reshape(pieces, FINE, 3)
         piece = segment.line_mass * 0.5 * h * np.einsum("f,kfi->ki", w, at)
         first_at = first + np.vstack((np.zeros(3), np.cumsum(piece, axis=0)))  # of the mass before every edge
         n = N0 - np.outer(mass + segment.line_mass * (edges - before), g)
         m = M0 - np.cross(p, n) - np.cross(first_at, g)
         ends, grown = _integrated(P, k, segment, solution.tension, R, p, n, m, g, h)
         longer += grown
-        turn = np.sqrt(np.abs(3 - np.einsum("kij,kij->k", ends[0], R[1:])))  # |angle| = sqrt(3 - tr) for small ones
+        turn = np.sqrt((_turn(np.einsum("kji,kjl->kil", ends[0], R[1:])) ** 2).sum(axis=1))
         stiff = min(segment.EI, segment.GJ)
         moments = np.sqrt((m**2).sum(axis=1))
         wrong_moment = max(wrong_moment, stiff / h * float(turn.max()))
         shift = np.sqrt(((ends[1] - p[1:]) ** 2).sum(axis=1))
         wrong_moment = max(wrong_moment, stiff / h**2 * float(shift.max()))
         wrong_moment = max(wrong_moment, float(np.abs(ends[2] - m[1:]).max()))
-        largest = max(largest, float(moments.max()))
+        largest = max(largest, float(moments.max()), segment.EI / segment.L * float(np.abs(solution.bend).max()))
         before += length
         mass += segment.line_mass * length
         first = first_at[-1]
@@ -119,8 +119,7 @@ def _integrated(P, k, segment, tension, R, p, n, m, g, h):
     offsets = segment.r * np.column_stack((np.cos(angle), np.sin(angle), np.zeros(angle.size)))
     gap2 = (segment.L / segment.disks) ** 2 / 24 if P.guides is Guides.DISKS else 0.0
     # The law may have another root where a tendon runs near the centre of curvature: begin near the one that is told.
-    turn = np.einsum("kji,kjl->kil", R[:-1], R[1:])
-    guess = 0.5 / h * np.stack([turn[:, i, j] - turn[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1)
+    guess = _turn(np.einsum("kji,kjl->kil", R[:-1], R[1:])) / h
     R, p, n, m = R[:-1], p[:-1], n[:-1], m[:-1]
 
     def slope(state):
@@ -145,6 +144,11 @@ def _integrated(P, k, segment, tension, R, p, n, m, g, h):
     grown = np.zeros(P.n)
     grown[here] = state[4].sum(axis=0)
     return (state[0], state[1], state[3]), grown
+
+
+def _turn(R):
+    """Rotation vectors (k, 3) of small rotations, which need not be quite orthogonal."""
+    return 0.5 * np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
 
 
 def _tip(asked, solution, n, m, R):

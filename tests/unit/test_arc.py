@@ -196,6 +196,23 @@ def test_arc_model_under_load_is_in_equilibrium_and_its_derivatives_are_slopes()
     assert np.allclose(change, solution.compliance[:, 0], atol=1e-4)
 
 
+def test_arc_model_takes_a_load_that_turns_with_the_tip_as_the_dead_one_that_it_ends_as():
+    model = ArcModel(ArmParameters.of(ArmConfig()))
+    pull, gravity = model.pull_for_bend((0.5, 0.2)), (1.0, 0.0, 9.0)
+    dead, follower = np.array((0.1, 0, 0, 0, 0, 0.01)), np.array((1.5, -0.8, 0.3, 0.02, 0.05, 0.01))
+    solution = model.free(pull, gravity, dead, follower_wrench=follower)
+    R = solution.tip_rotation
+    turned = np.concatenate((R @ follower[:3], R @ follower[3:]))
+    assert np.allclose(solution.tip_wrench, dead + turned)
+    same = model.free(pull, gravity, dead + turned)
+    assert np.allclose(solution.bend, same.bend, atol=1e-9)
+    assert solution.iterations < 8  # quadratic: the stiffness knows that the load turns
+    h, force = 1e-5, np.eye(6)[0]
+    a, b = (model.free(pull, gravity, dead + k * h * force, follower_wrench=follower) for k in (1, -1))
+    change = (a.tip_position - b.tip_position) / (2 * h)
+    assert np.allclose(change, solution.compliance[:3, 0], atol=1e-6)
+
+
 def test_arc_model_held_where_it_is_exerts_nothing_and_resists_when_moved():
     model = ArcModel(P)
     pull = model.pull_for_bend((0.5, 0.2))

@@ -335,3 +335,19 @@ def test_a_servo_that_lost_its_turns_is_a_fault_even_without_torque(parameters: 
     assert answer.result is Result.TEMPORARILY_REJECTED
     assert "lost its turns" in answer.reason
     assert said[-1].status.error_bits & ArmFault.SERVO_FAULT
+
+
+def test_a_prediction_starts_from_the_last_and_says_what_a_first_one_would(
+    hovering: Hovering, parameters: Parameters
+) -> None:
+    first, _ = run(at(Phase.READY), hovering((0.5, 0.0)), parameters)
+    facts = hovering((0.505, 0.0))
+    warm, _ = run(first, facts, parameters, 0.1)
+    alone, _ = run(at(Phase.READY), facts, parameters)
+    assert warm.prediction is not None
+    assert alone.prediction is not None
+    assert warm.prediction.free is not None
+    assert alone.prediction.free is not None
+    assert warm.prediction.free.iterations < alone.prediction.free.iterations
+    assert warm.prediction.tip_a == pytest.approx(alone.prediction.tip_a, abs=1e-7)
+    assert warm.prediction.wrench.force_b == pytest.approx(alone.prediction.wrench.force_b, abs=1e-6)

@@ -25,6 +25,23 @@ def test_random_cases_are_solved_or_refused_and_none_is_wrong() -> None:
     assert tally.solved > 35
 
 
+@pytest.mark.parametrize(
+    ("seed", "number"),
+    [
+        (12, 1187),  # two turns held by tendons hid an error of a small force on the base
+        (12, 1339),  # a sharp bend at either end
+        (12, 519),  # nothing but tendons
+        (11, 394),  # a tendon near the centre of curvature
+    ],
+)
+def test_what_was_hard_once(seed: int, number: int) -> None:
+    tally = Tally()
+    for case, model in cases(seed, 1, first=number, fast=False):
+        if case.number == number:
+            judge(case, model, tally)
+    assert (tally.cases, tally.solved, tally.wrong) == (1, 1, [])
+
+
 @pytest.mark.parametrize("wrong", ["load", "moment", "gravity", "pull", "stiffness", "hold"])
 def test_an_answer_to_another_question_is_caught(wrong: str) -> None:
     """A hundredth off in what was asked shows far above what an answer may be off."""
