@@ -12,7 +12,8 @@ _COMMANDS = {
     "run": "the daemon: fly the arm",
     "sim": "fly a scenario in the simulated world with the real daemon",
     "model": "the arm's mechanics: one equilibrium, or the paper's experiments",
-    "calibrate": "fit the model to measurements",
+    "calibrate": "tendons and tensions on the bench, the model from measurements",
+    "jog": "bend the arm from the keyboard, while no daemon runs",
     "config": "check or show a configuration",
 }
 
