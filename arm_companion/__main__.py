@@ -13,8 +13,9 @@ _COMMANDS = {
     "ground": "hear and command the arm from the ground",
     "sim": "fly a scenario in the simulated world with the real daemon",
     "model": "the arm's mechanics: one equilibrium, or the paper's experiments",
-    "calibrate": "fit the model to measurements",
+    "calibrate": "tendons and tensions on the bench, the model from measurements",
     "servos": "find, set up and watch the servos",
+    "jog": "bend the arm from the keyboard, while no daemon runs",
     "config": "check or show a configuration",
 }
 

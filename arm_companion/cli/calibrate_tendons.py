@@ -25,7 +25,7 @@ from arm_companion.drivers.calibration import (
 )
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.workshop.rig import Rig, m_per_tick
-from arm_companion.workshop.tendon_zeros import Found, Options, Progress, Setup, Zero, procedure
+from arm_companion.workshop.tendon_zeros import Found, Options, Progress, Setup, Zero, least_slack, procedure
 
 _PROGRESS = "tendons.progress.json"
 _PROGRESS_LASTS_S = 12 * 3600.0
@@ -94,6 +94,11 @@ def _options(arguments: argparse.Namespace, config: Config) -> Options:
         if not lower <= value <= upper:
             scale = 1.0 if field.name == "threshold" else 1e3
             raise RefusedError(f"--{field.name}: {scale * value:g} is not in {scale * lower:g} to {scale * upper:g}")
+    needed = least_slack(ArmParameters.of(config.arm), options.threshold)
+    if options.slack < needed:
+        raise RefusedError(
+            f"--slack: {options.threshold:g} N bend the arm so far that {1e3 * needed:.0f} mm are needed"
+        )
     return options
 
 

@@ -120,8 +120,10 @@ class ParkingLog:
 
     def note(self, servos: Sequence[ServoState]) -> None:
         """Look at the servos; called once a cycle."""
+        if self._writer is None or not servos or (self._writing is not None and not self._writing.done()):
+            return
         now = asyncio.get_running_loop().time()
-        if self._writer is None or now < self._next_at or (self._writing is not None and not self._writing.done()):
+        if now < self._next_at:
             return
         self._next_at = now + _NOTE_EVERY_S
         if self._take(servos):

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from arm_companion.errors import NoSolution
 from arm_companion.geometry.arrays import Array
@@ -20,109 +21,73 @@ _REFINEMENTS = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Baseline:
-    """Load of a servo that turns without pulling: friction of its gears, and the reading's own offset."""
-
-    inwards: float  # share of full load, mean
-    outwards: float
-    noise: float  # one sigma of one reading
-    samples: int
-
-    @property
-    def friction(self) -> float:
-        """Half of the difference, share of full load."""
-        return 0.5 * (self.inwards - self.outwards)
-
-
-@dataclass(frozen=True, slots=True)
 class Knee:
-    """Where a tendon alone becomes taut.
+    """Where a tendon alone becomes taut, and the load of its servo before that.
 
     Attributes:
         at: m wound up.
         sigma: one sigma of it, m.
-        slope: by which its tension grows from there, N/m.
+        slope: by which the load grows from there, share of full load per m.
+        inwards: load of the slack servo on the way in, share of full load: friction, and the reading's own offset.
+        outwards: the same on the way out.
+        noise: one sigma of one reading of the load.
     """
 
     at: float
     sigma: float
     slope: float
+    inwards: float
+    outwards: float
+    noise: float
+
+    @property
+    def friction(self) -> float:
+        """Of the gears, share of full load: half of what the direction makes."""
+        return 0.5 * (self.inwards - self.outwards)
 
 
-def baseline(inwards: Sequence[float], outwards: Sequence[float]) -> Baseline:
-    """From loads (shares) of a slack tendon's servo on the way in and on the way out.
+def knee(wound: Sequence[float], load: Sequence[float], inwards: Sequence[bool]) -> Knee:
+    """Fit `load = level(direction) + slope max(0, wound - at)` by least squares.
 
-    Raises:
-        NoSolution: too few readings.
-    """
-    if min(len(inwards), len(outwards)) < _LEAST_SAMPLES:
-        raise NoSolution(math.inf, "too few readings of the slack tendon")
-    i, o = np.asarray(inwards), np.asarray(outwards)
-    noise = math.sqrt((float(i.var(ddof=1)) + float(o.var(ddof=1))) / 2.0)
-    return Baseline(float(i.mean()), float(o.mean()), noise, min(len(i), len(o)))
-
-
-def knee(wound: Sequence[float], force: Sequence[float], noise: float) -> Knee:
-    """Fit `force = max(0, slope (wound - at))` by least squares.
+    Given `at` the rest is linear, so only `at` is searched for.
 
     Args:
         wound: (n,) m.
-        force: (n,) N, friction taken off.
-        noise: of one force, N; the scatter about the fit counts when it is larger.
+        load: (n,) share of full load.
+        inwards: (n,) whether the servo took in.
 
     Raises:
-        NoSolution: the force does not rise.
+        NoSolution: too few readings, or the load does not rise.
     """
-    w, f = np.asarray(wound, dtype=np.float64), np.asarray(force, dtype=np.float64)
-    if w.size < _LEAST_SAMPLES:
+    w, y = np.asarray(wound), np.asarray(load)
+    way = np.asarray(inwards, dtype=np.bool_)
+    if min(int(way.sum()), int((~way).sum())) < _LEAST_SAMPLES:
         raise NoSolution(math.inf, "too few readings")
     low, high = float(w.min()), float(w.max())
-    best = low
+    at = low
     for _ in range(_REFINEMENTS):
         grid = np.linspace(low, high, _GRID)
-        costs = [_hinge(w, f, float(at))[1] for at in grid]
-        k = int(np.argmin(costs))
-        best = float(grid[k])
-        low, high = float(grid[max(k - 1, 0)]), float(grid[min(k + 1, _GRID - 1)])
-    slope, cost = _hinge(w, f, best)
+        k = int(np.argmin([_hinge(w, y, way, float(g))[1] for g in grid]))
+        at, low, high = float(grid[k]), float(grid[max(k - 1, 0)]), float(grid[min(k + 1, _GRID - 1)])
+    x, cost = _hinge(w, y, way, at)
+    level_in, level_out, slope = (float(v) for v in x)
     if not slope > 0.0:
-        raise NoSolution(math.inf, "the tension does not rise")
-    h = np.maximum(w - best, 0.0)
-    J = np.column_stack((-slope * (h > 0.0), h))
-    scatter = max(noise, math.sqrt(cost / max(w.size - 2, 1)))
+        raise NoSolution(math.inf, "the load does not rise")
+    J = np.column_stack((-slope * (w > at), way, ~way, np.maximum(w - at, 0.0))).astype(np.float64)
+    variance = cost / max(w.size - 4, 1)
     try:
-        covariance = scatter**2 * np.linalg.inv(J.T @ J)
-    except np.linalg.LinAlgError:
-        raise NoSolution(math.inf, "the knee is not seen") from None
-    return Knee(best, math.sqrt(float(covariance[0, 0])), slope)
+        sigma = math.sqrt(variance * float(np.linalg.inv(J.T @ J)[0, 0]))
+    except (np.linalg.LinAlgError, ValueError):
+        raise NoSolution(math.inf, "it is not seen where the load begins to rise") from None
+    return Knee(at, sigma, slope, level_in, level_out, math.sqrt(variance))
 
 
-def _hinge(w: Array, f: Array, at: float) -> tuple[float, float]:
-    """Slope of the best hinge with its knee `at`, and its sum of squares."""
-    h = np.maximum(w - at, 0.0)
-    square = float(h @ h)
-    slope = float(h @ f) / square if square > 0.0 else 0.0
-    r = f - slope * h
-    return slope, float(r @ r)
-
-
-def crossing(x: Sequence[float], y: Sequence[float], level: float, noise: float) -> tuple[float, float]:
-    """Where the straight line through points (x, y) reaches `level`, and one sigma of that.
-
-    Raises:
-        NoSolution: too few points, or no line that rises.
-    """
-    a, b = np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64)
-    if a.size < _LEAST_SAMPLES or float(np.ptp(a)) == 0.0:
-        raise NoSolution(math.inf, "too few readings of all tendons together")
-    middle = float(a.mean())
-    slope, height = (float(c) for c in np.polyfit(a - middle, b, 1))
-    if not slope > 0.0:
-        raise NoSolution(math.inf, "the tensions do not rise together")
-    scatter = max(noise, float(np.std(b - slope * (a - middle) - height, ddof=min(2, a.size - 1))))
-    away = (level - height) / slope
-    spread = float(((a - middle) ** 2).sum())
-    return middle + away, scatter / slope * math.sqrt(1.0 / a.size + away * away / spread)
+def _hinge(w: Array, y: Array, way: npt.NDArray[np.bool_], at: float) -> tuple[Array, float]:
+    """Levels and slope of the best hinge with its knee `at` (3,), and its sum of squares."""
+    A = np.column_stack((way, ~way, np.maximum(w - at, 0.0)))
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
+    r = y - A @ x
+    return x, float(r @ r)
 
 
 def balanced(H: Array) -> Array:

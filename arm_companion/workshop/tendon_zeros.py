@@ -1,5 +1,6 @@
 """`calibrate tendons` as a procedure: slack off, take up each tendon in turn, then all together, then store."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,13 +10,19 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.tension import LoadCurve
 from arm_companion.drivers.calibration import ServoIdentity
 from arm_companion.errors import ArmError, ModelError
+from arm_companion.geometry.arrays import Array
 from arm_companion.workshop.actions import Ask, Engage, Keep, Move, Procedure, Release, Say, Stop, Trace
-from arm_companion.workshop.take_up import Baseline, balanced, baseline, combine, crossing, knee
+from arm_companion.workshop.take_up import balanced, combine, knee
 
 _FREE_RUN_M = 0.005
 _STROKES = 6
+_STROKE_SPEED = 0.004  # m/s, at most
 _LEAD = 10  # samples in which a servo starts or stops
 _CLEAR_M = 0.001
+_LEAST_TAUT = 50  # samples
+_LEAST_SHARE = 0.2  # of the pretension, that every tendon must have when all are taken up
+_STIFFNESS_SPREAD = 0.2  # relative, of the tendons' stiffness
+_LEVEL_READINGS = 300  # about as many tell the load of a slack servo
 _LET_OUT_TRIES = 3
 _TIGHT = 1.5  # times the pretension, to which all tendons are taken together
 _LINE_FROM = 0.4  # of the pretension: above it every tendon is taut
@@ -30,9 +37,14 @@ class Options:
     """How gently."""
 
     threshold: float = 3.0  # N, at which a tendon alone counts as taken up
-    slack: float = 0.012  # m, by which all tendons are let out first
-    speed: float = 0.004  # m/s
-    travel: float = 0.06  # m, farthest way to the threshold
+    slack: float = 0.025  # m, by which all tendons are let out first
+    speed: float = 0.005  # m/s
+    travel: float = 0.07  # m, farthest way to the threshold
+
+
+def least_slack(arm: ArmParameters, threshold: float) -> float:
+    """Slack, m, that the opposite tendon needs when one alone pulls with `threshold` N and bends the arm towards it."""
+    return arm.r**2 * arm.L / arm.EI * threshold + 0.002
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,17 +53,11 @@ class Found:
 
     knee_ticks: float
     sigma: float  # m
-    slope: float  # N/m
-    inwards: float  # baseline, share of full load
+    inwards: float  # load of the slack servo on the way in, share of full load
     outwards: float
     noise: float
-    samples: int
+    friction: float  # N
     temperature: float  # degC
-
-    @property
-    def baseline(self) -> Baseline:
-        """Of the slack tendon."""
-        return Baseline(self.inwards, self.outwards, self.noise, self.samples)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +137,7 @@ def procedure(setup: Setup, done: tuple[Found, ...] = ()) -> Procedure[tuple[Zer
         Zero(
             round(origin[i] + setup.directions[i] * float(zeros[i]) / setup.m_per_tick),
             float(sigmas[i]),
-            setup.curves[i].gain * one.baseline.friction,
+            one.friction,
             one.temperature,
         )
         for i, one in enumerate(found)
@@ -151,7 +157,7 @@ def _take_up(setup: Setup, i: int, origin: Sequence[int], slack: float) -> Proce
         if at > slack + _FREE_RUN_M + _CLEAR_M:
             yield Say(
                 f"{name} is taut from {1e3 * at:+.2f} mm on, give or take {1e3 * one.sigma:.2f} mm; its gears take "
-                f"{setup.curves[i].gain * one.baseline.friction:.1f} N."
+                f"{one.friction:.1f} N."
             )
             return one, slack
         slack -= options.slack
@@ -179,27 +185,22 @@ def _in_and_out(setup: Setup, i: int, origin: Sequence[int], slack: float, *, as
     ):
         raise Refused(f"{name} pulls elsewhere: check servos.ids, servos.directions and arm.tendons.angles_deg")
     back: Trace = yield Move((slack,) * setup.n, options.speed)
+    parts = ((free.samples[_LEAD:], True), (taken.samples[_LEAD:], True), (back.samples[_LEAD:-_LEAD], False))
     try:
-        base = baseline(running, [s.load[i] for s in back.samples[:-_LEAD] if s.wound[i] < slack + _FREE_RUN_M])
-        wound, force = [], []
-        for samples, level in (
-            (free.samples[_LEAD:], base.inwards),
-            (taken.samples[_LEAD:], base.inwards),
-            (back.samples[_LEAD:-_LEAD], base.outwards),
-        ):
-            wound += [s.wound[i] for s in samples]
-            force += [gain * (s.load[i] - level) for s in samples]
-        bend = knee(wound, force, gain * base.noise)
+        bend = knee(
+            [sample.wound[i] for samples, _ in parts for sample in samples],
+            [sample.load[i] for samples, _ in parts for sample in samples],
+            [inwards for samples, inwards in parts for _ in samples],
+        )
     except ModelError as error:
         raise Refused(f"{name}: {error}") from error
     return Found(
         origin[i] + setup.directions[i] * bend.at / setup.m_per_tick,
         bend.sigma,
-        bend.slope,
-        base.inwards,
-        base.outwards,
-        base.noise,
-        base.samples,
+        bend.inwards,
+        bend.outwards,
+        bend.noise,
+        gain * bend.friction,
         back.samples[-1].temperature[i],
     )
 
@@ -216,7 +217,7 @@ def _one(setup: Setup, i: int, rest: float, wound: float) -> tuple[float, ...]:
     return tuple(wound if k == i else rest for k in range(setup.n))
 
 
-def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> Procedure[tuple[np.ndarray, np.ndarray]]:
+def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> Procedure[tuple[Array, Array]]:
     """All tendons at once, which holds the arm straight: their common tightness."""
     arm, options = setup.arm, setup.options
     tight = tuple(
@@ -228,12 +229,11 @@ def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> P
         f"{_STROKES} times.\nThe arm stays straight; this tells how tight they are against each other."
     )
     yield Move(loose, options.speed)
-    N = balanced(arm.H)
-    x: list[np.ndarray] = []
-    y: list[np.ndarray] = []
+    x: list[Array] = []
+    y: list[Array] = []
     for _ in range(_STROKES):
         for goal, inwards in ((tight, True), (loose, False)):
-            trace: Trace = yield Move(goal, options.speed)
+            trace: Trace = yield Move(goal, min(options.speed, _STROKE_SPEED))
             for sample in trace.samples[_LEAD:-_LEAD]:
                 force = [
                     setup.curves[i].gain
@@ -243,28 +243,31 @@ def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> P
                 ]
                 x.append(np.asarray(sample.wound))
                 y.append(np.asarray(force))
-    return _solve(setup, found, np.asarray(knees), N, np.asarray(x), np.asarray(y))
+    return _solve(setup, found, np.asarray(knees), np.asarray(x), np.asarray(y))
 
 
-def _solve(
-    setup: Setup, found: Sequence[Found], knees: np.ndarray, N: np.ndarray, x: np.ndarray, y: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Zeros (n,), m, and their sigma, from knees (n,), m, and from lengths x (q, n), m, with tensions y (q, n), N."""
+def _solve(setup: Setup, found: Sequence[Found], knees: Array, x: Array, y: Array) -> tuple[Array, Array]:
+    """Zeros (n,), m, and their sigma, from knees (n,), m, and from lengths x (q, n), m, with tensions y (q, n), N.
+
+    A taut tendon has `x = zero + H u + (tension - T0) / k`. What bends nothing is orthogonal to H, so that the bend u,
+    which nobody knows, drops out of `N^T x`.
+    """
     arm = setup.arm
     stretch = arm.T0 / arm.k_T  # from the knee to the pretension, for the arm held straight
-    noise = np.array([curve.gain * one.noise for curve, one in zip(setup.curves, found, strict=True)])
     taut = x.mean(axis=1) > float(np.mean(knees + _LINE_FROM * stretch))
-    together, spread = [], []
-    try:
-        for column in N.T:
-            sign = 1.0 if float(column.sum()) >= 0.0 else -1.0
-            level = float(sign * column @ arm.T0)
-            at, sigma = crossing(
-                x[taut] @ (sign * column), y[taut] @ (sign * column), level, float(np.linalg.norm(column * noise))
-            )
-            together.append(sign * at)
-            spread.append(sigma)
-    except ModelError as error:
-        raise Refused(f"all tendons together: {error}; is one of them caught?") from error
+    count = int(taut.sum())
+    tension = y[taut].mean(axis=0) if count else np.zeros(setup.n)
+    if count < _LEAST_TAUT or tension.min() < _LEAST_SHARE * float(arm.T0.min()):
+        weakest = int(np.argmin(tension))
+        raise Refused(
+            f"all together, {_name(setup, weakest)} pulls with {float(tension[weakest]):.1f} N where about "
+            f"{float(arm.T0[weakest]):.1f} N were expected: is a tendon caught, or is arm.tendons not this arm's?"
+        )
+    N = balanced(arm.H)
+    together = N.T @ (x[taut].mean(axis=0) - (tension - arm.T0) / arm.k_T)
+    noise = np.array([curve.gain * one.noise for curve, one in zip(setup.curves, found, strict=True)])
+    # of the readings here, of the slack servos' loads before, and of the stiffness that is taken for granted
+    spread = np.hypot(noise * math.sqrt(1.0 / count + 1.0 / _LEVEL_READINGS), _STIFFNESS_SPREAD * (tension - arm.T0))
+    together_sigma = np.sqrt(N.T**2 @ np.square(spread / arm.k_T))
     alone_sigma = np.array([one.sigma for one in found])
-    return combine(knees + stretch, alone_sigma, N, np.asarray(together), np.asarray(spread))
+    return combine(knees + stretch, alone_sigma, N, together, together_sigma)
