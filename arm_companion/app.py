@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from arm_companion.arm import compiled
+from arm_companion.arm.model import ArmModel
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import Clock, Tick, ticks
@@ -85,6 +86,7 @@ class Daemon:
         recorder: Recorder | None = None,
         *,
         compiled_model: bool = False,
+        model: ArmModel | None = None,
     ) -> None:
         if not any(link.role == "autopilot" for link in config.links.values()):
             raise ConfigError("links: none has the role autopilot")
@@ -96,7 +98,7 @@ class Daemon:
         self._manager = manager
         self._recorder = _recorder(config, clock) if recorder is None else recorder
         self._compiled_model = compiled_model
-        self._parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
+        self._parameters = Parameters(config, model or RodModel(ArmParameters.of(config.arm)))
         self._links = [
             MavlinkLink(name, link.role, openers.links[name], config.vehicle, config=link)
             for name, link in config.links.items()

@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from arm_companion.app import Daemon, Openers
+from arm_companion.arm import compiled
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock
 from arm_companion.config.schema import Config
 from arm_companion.errors import ArmError
@@ -58,7 +61,7 @@ async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: N
         },
         servos.opener(1),
     )
-    daemon = Daemon(config, openers, clock, ServiceManager(""), recorder)
+    daemon = Daemon(config, openers, clock, ServiceManager(""), recorder, model=_model(config))
     bus = EmulatedBus(world.servos, config.servos)
     flight = Flight(samples=world.samples)
     link = OperatorLink([ground.opener(1), arm.opener(1)])
@@ -74,6 +77,15 @@ async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: N
         stop.set()
         await asyncio.sleep(0.5)
     return Result(flight, failure, daemon.cycles, daemon.missed, recorder.records)
+
+
+def _model(config: Config) -> RodModel:
+    """The rod that the daemon flies with, compiled where that costs no compiling."""
+    try:
+        compiled.load(compiling=False)
+    except compiled.NotCompiled:
+        return RodModel(ArmParameters.of(config.arm))
+    return RodModel(ArmParameters.of(config.arm), fast=True)
 
 
 async def fly_real_time(
