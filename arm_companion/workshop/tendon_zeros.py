@@ -294,8 +294,10 @@ def _solve(setup: Setup, found: Sequence[Found], knees: Array, x: Array, y: Arra
     N = balanced(arm.H)
     together = N.T @ (x.mean(axis=0) - (tension - arm.T0) / arm.k_T)
     noise = np.array([curve.gain * one.noise for curve, one in zip(setup.curves, found, strict=True)])
-    # of the readings here, of the slack servos' loads before, and of the stiffness that is taken for granted
-    spread = np.hypot(noise * math.sqrt(1.0 / count + 1.0 / _LEVEL_READINGS), _STIFFNESS_SPREAD * (tension - arm.T0))
+    # of the readings here, of the slack servos' loads before, of the gain, and of the stiffness taken for granted
+    readings = noise * math.sqrt(1.0 / count + 1.0 / _LEVEL_READINGS)
+    gain = np.array([curve.gain_sigma for curve in setup.curves]) * arm.T0
+    spread = np.sqrt(readings**2 + gain**2 + (_STIFFNESS_SPREAD * (tension - arm.T0)) ** 2)
     together_sigma = np.sqrt(N.T**2 @ np.square(spread / arm.k_T))
     alone_sigma = np.array([one.sigma for one in found])
     return combine(knees + stretch, alone_sigma, N, together, together_sigma)
