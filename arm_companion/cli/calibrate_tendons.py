@@ -85,7 +85,7 @@ def _options(arguments: argparse.Namespace, config: Config) -> Options:
     options = Options(arguments.threshold, arguments.slack / 1e3, arguments.speed / 1e3, arguments.travel / 1e3)
     bounds = {
         "threshold": (0.5, 0.5 * config.limits.tension_max_n),
-        "slack": (0.005, 0.5 * config.limits.pull_max_m),
+        "slack": (0.01, 0.5 * config.limits.pull_max_m),
         "speed": (0.001, min(0.04, 0.5 * config.limits.pull_speed_m_per_s)),
         "travel": (0.01, config.limits.pull_max_m),
     }

@@ -27,7 +27,7 @@ def add_parser(commands: "argparse._SubParsersAction[NumberParser]") -> None:
     sub.set_defaults(calibrate=run)
     sub.add_argument("--tendon", type=int, action="append", metavar="N", help="only this one; may be repeated")
     sub.add_argument("--with", choices=("weights", "scale"), default="weights", dest="means", help="default: weights")
-    sub.add_argument("--travel-mm", type=float, default=10.0, metavar="X", help="of each stroke (default: 10)")
+    sub.add_argument("--travel-mm", type=float, default=20.0, metavar="X", help="of each stroke (default: 20)")
     sub.add_argument("--speed-mm-s", type=float, default=4.0, metavar="X", help="of each stroke (default: 4)")
 
 

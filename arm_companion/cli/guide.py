@@ -92,7 +92,7 @@ def state_directory(arguments: argparse.Namespace, config: Config) -> Path:
 
 
 def on_the_bench(config: Config, work: Callable[[Rig, ServoBus], Awaitable[T]]) -> T | None:
-    """Run `work` with the servos of the arm; whatever ends it, tendons are eased and the torque goes off.
+    """Run `work` with the servos of the arm; whatever ends it, the tendons go back and the torque off.
 
     The first Ctrl-C (or SIGTERM, SIGHUP) ends the work in this orderly way, a second one switches the torque off at
     once.
@@ -132,7 +132,7 @@ async def _guarded(config: Config, work: Callable[[Rig, ServoBus], Awaitable[T]]
     except* asyncio.CancelledError:
         if not interrupted:
             raise
-        _tell("interrupted: tendons are let out, then the torque goes off (Ctrl-C again: off at once)")
+        _tell("interrupted: back to where the tendons were, then torque off (Ctrl-C again: off at once)")
     except* DeviceFault as faults:
         raise RefusedError("; ".join(str(fault) for fault in _leaves(faults))) from faults
     except* ArmError as errors:

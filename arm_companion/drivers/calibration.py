@@ -21,6 +21,7 @@ from arm_companion.protocol.control_table import TICK_RAD
 VERSION = 1
 _DAY_S = 86_400.0
 _SAME = 1e-9  # relative
+_HOME = "arm straight? then CLEAR_ERRORS"
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +119,9 @@ def turned(servos: Sequence[ServoState], parked: Mapping[int, int]) -> str:
         if not servo.turns_lost:
             continue
         if servo.id not in parked:
-            return f"servo {servo.id} (tendon {i + 1}) has lost its turns"
+            return f"servo {servo.id} (tendon {i + 1}) has lost its turns ({_HOME})"
         by = nearest_turn(servo.position, parked[servo.id]) - parked[servo.id]
-        return f"servo {servo.id} (tendon {i + 1}) was turned by {by} ticks while its power was off"
+        return f"servo {servo.id} (tendon {i + 1}) was turned by {by} ticks without power ({_HOME})"
     return ""
 
 

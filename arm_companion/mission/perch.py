@@ -249,11 +249,11 @@ def cannot_depart(s: Situation) -> str | None:
 
 def cannot_ready(s: Situation) -> str | None:
     """Why the arm cannot be made ready now."""
-    if (fault := s.servo_fault) is not None:
-        return fault
+    if s.facts.calibration.refusal:  # of a servo that was turned it knows more than the servo's own fault
+        return s.facts.calibration.refusal
     if (fault := s.tendon_fault) is not None:
         return f"{fault}; mend it, then CLEAR_ERRORS"
-    return s.facts.calibration.refusal or None
+    return s.servo_fault
 
 
 def cannot_perch(s: Situation) -> str | None:

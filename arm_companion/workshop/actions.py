@@ -46,15 +46,19 @@ class Release:
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """Ends a move early: the smoothed load of one servo has risen this far.
+    """Ends a move early: the smoothed load of one servo, or the mean of all, has risen this far.
 
     Attributes:
-        servo: its place in the tendons' order.
+        servo: its place in the tendons' order; None for the mean of all.
         load: share of full load, positive when pulling.
     """
 
-    servo: int
+    servo: int | None
     load: float
+
+    def of(self, loads: tuple[float, ...]) -> float:
+        """The load that counts."""
+        return sum(loads) / len(loads) if self.servo is None else loads[self.servo]
 
 
 @dataclass(frozen=True, slots=True)

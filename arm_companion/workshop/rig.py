@@ -33,7 +33,8 @@ from arm_companion.workshop.actions import (
 PERIOD_S = 0.01
 _SETTLE_M = 0.0003
 _SETTLE_S = 1.0
-_SMOOTHED = 12  # readings
+_SMOOTHED = 20  # readings
+_STARTING = 15  # cycles in which a servo gathers speed, which looks like a load
 _TORQUE_S = 2.0
 _EASE_M_PER_S = 0.02
 _EASE_S = 6.0
@@ -232,7 +233,7 @@ class Rig:
             self._goal = tuple(begin + share * (goal - begin) for goal, begin in zip(action.wound, start, strict=True))
             sample = self._sample(await self._cycle())
             samples.append(sample)
-            if action.stop is not None and self._reached(action.stop, sample, recent):
+            if action.stop is not None and len(samples) > _STARTING and self._reached(action.stop, sample, recent):
                 self._goal = sample.wound  # and no further
                 return Trace(tuple(samples), stopped=True)
             if gone < way:
@@ -244,7 +245,7 @@ class Rig:
         return Trace(tuple(samples))
 
     def _reached(self, stop: Stop, sample: Sample, recent: "deque[float]") -> bool:
-        recent.append(sample.load[stop.servo])
+        recent.append(stop.of(sample.load))
         return len(recent) == _SMOOTHED and sum(recent) / _SMOOTHED > stop.load
 
     def _sample(self, states: Sequence[ServoState]) -> Sample:
@@ -269,7 +270,7 @@ class Rig:
         return states
 
     async def make_safe(self) -> None:
-        """Let tendons out to where they were when the torque came on, slowly, then switch the torque off.
+        """Take the tendons back to where they were when the torque came on, slowly, then switch the torque off.
 
         What cannot be done any more is left out; the torque is switched off in any case. A rig that never switched
         it on does nothing.
@@ -281,10 +282,9 @@ class Rig:
             return
         try:
             if self._goal is not None:
-                rest = tuple(min(wound, 0.0) for wound in self._goal)
                 with contextlib.suppress(ArmError, TimeoutError):
                     async with asyncio.timeout(_EASE_S):
-                        await self.move(Move(rest, _EASE_M_PER_S))
+                        await self.move(Move((0.0,) * len(self._goal), _EASE_M_PER_S))
         finally:
             self._tendons = self._goal = None
             await self._bus.limp()

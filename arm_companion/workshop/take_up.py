@@ -18,6 +18,7 @@ from arm_companion.geometry.arrays import Array
 _LEAST_SAMPLES = 8
 _GRID = 60
 _REFINEMENTS = 4
+_MOST_CORRELATED = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +72,7 @@ def knee(wound: Sequence[float], load: Sequence[float], inwards: Sequence[bool])
         at, low, high = float(grid[k]), float(grid[max(k - 1, 0)]), float(grid[min(k + 1, _GRID - 1)])
     x, cost = _hinge(w, y, way, at)
     level_in, level_out, slope = (float(v) for v in x)
+    r = y - _basis(w, way, at) @ x
     if not slope > 0.0:
         raise NoSolution(math.inf, "the load does not rise")
     J = np.column_stack((-slope * (w > at), way, ~way, np.maximum(w - at, 0.0))).astype(np.float64)
@@ -79,15 +81,26 @@ def knee(wound: Sequence[float], load: Sequence[float], inwards: Sequence[bool])
         sigma = math.sqrt(variance * float(np.linalg.inv(J.T @ J)[0, 0]))
     except (np.linalg.LinAlgError, ValueError):
         raise NoSolution(math.inf, "it is not seen where the load begins to rise") from None
-    return Knee(at, sigma, slope, level_in, level_out, math.sqrt(variance))
+    return Knee(at, sigma * _correlation(r), slope, level_in, level_out, math.sqrt(variance))
 
 
 def _hinge(w: Array, y: Array, way: npt.NDArray[np.bool_], at: float) -> tuple[Array, float]:
     """Levels and slope of the best hinge with its knee `at` (3,), and its sum of squares."""
-    A = np.column_stack((way, ~way, np.maximum(w - at, 0.0)))
+    A = _basis(w, way, at)
     x, *_ = np.linalg.lstsq(A, y, rcond=None)
     r = y - A @ x
-    return x, float(r @ r)
+    return np.asarray(x, dtype=np.float64), float(r @ r)
+
+
+def _basis(w: Array, way: npt.NDArray[np.bool_], at: float) -> Array:
+    return np.column_stack((way, ~way, np.maximum(w - at, 0.0)))
+
+
+def _correlation(r: Array) -> float:
+    """By how much sigmas grow because one residual (n,) resembles the next: the arm swings, servos stick and slip."""
+    rho = float(r[1:] @ r[:-1]) / max(float(r @ r), 1e-30)
+    rho = min(max(rho, 0.0), _MOST_CORRELATED)
+    return math.sqrt((1.0 + rho) / (1.0 - rho))
 
 
 def balanced(H: Array) -> Array:

@@ -11,12 +11,15 @@ from arm_companion.arm.tension import LoadCurve
 from arm_companion.drivers.calibration import ServoIdentity
 from arm_companion.errors import ArmError, ModelError
 from arm_companion.geometry.arrays import Array
-from arm_companion.workshop.actions import Ask, Engage, Keep, Move, Procedure, Release, Say, Stop, Trace
+from arm_companion.workshop.actions import Ask, Engage, Keep, Move, Procedure, Release, Sample, Say, Stop, Trace
 from arm_companion.workshop.take_up import balanced, combine, knee
 
-_FREE_RUN_M = 0.005
-_STROKES = 6
+_FREE_RUN_M = 0.008
+_STROKES = 8
+_FIRST_STROKES = 2  # which even out the tendons
 _STROKE_SPEED = 0.004  # m/s, at most
+_LOOSE_M = 0.0005
+_FARTHEST_M = 0.01
 _LEAD = 10  # samples in which a servo starts or stops
 _CLEAR_M = 0.001
 _LEAST_TAUT = 50  # samples
@@ -25,7 +28,6 @@ _STIFFNESS_SPREAD = 0.2  # relative, of the tendons' stiffness
 _LEVEL_READINGS = 300  # about as many tell the load of a slack servo
 _LET_OUT_TRIES = 3
 _TIGHT = 1.5  # times the pretension, to which all tendons are taken together
-_LINE_FROM = 0.4  # of the pretension: above it every tendon is taut
 
 
 class Refused(ArmError):
@@ -36,10 +38,10 @@ class Refused(ArmError):
 class Options:
     """How gently."""
 
-    threshold: float = 3.0  # N, at which a tendon alone counts as taken up
-    slack: float = 0.025  # m, by which all tendons are let out first
-    speed: float = 0.005  # m/s
-    travel: float = 0.07  # m, farthest way to the threshold
+    threshold: float = 4.0  # N, at which a tendon alone counts as taken up
+    slack: float = 0.028  # m, by which all tendons are let out first
+    speed: float = 0.003  # m/s
+    travel: float = 0.08  # m, farthest way to the threshold
 
 
 def least_slack(arm: ArmParameters, threshold: float) -> float:
@@ -149,7 +151,7 @@ def _take_up(setup: Setup, i: int, origin: Sequence[int], slack: float) -> Proce
     options, name = setup.options, _name(setup, i)
     yield Ask(
         f"Slack of {name} is taken up until it pulls with {options.threshold:g} N. Alone it bends the arm towards it\n"
-        "by some 45 degrees; that tells where it becomes taut. Then it is let out again."
+        "by some 60 degrees; that tells where it becomes taut. Then it is let out again."
     )
     for attempt in range(_LET_OUT_TRIES):
         one = yield from _in_and_out(setup, i, origin, slack, ask=attempt == 0)
@@ -220,30 +222,57 @@ def _one(setup: Setup, i: int, rest: float, wound: float) -> tuple[float, ...]:
 def _together(setup: Setup, found: Sequence[Found], knees: Sequence[float]) -> Procedure[tuple[Array, Array]]:
     """All tendons at once, which holds the arm straight: their common tightness."""
     arm, options = setup.arm, setup.options
-    tight = tuple(
-        at + min(_TIGHT * float(arm.T0[i]), 0.5 * setup.tension_max) / float(arm.k_T[i]) for i, at in enumerate(knees)
-    )
-    loose = tuple(at - 0.0005 for at in knees)
     yield Ask(
         f"All tendons are taken up together, to about {_TIGHT * float(arm.T0.max()):.0f} N and back, "
         f"{_STROKES} times.\nThe arm stays straight; this tells how tight they are against each other."
     )
-    yield Move(loose, options.speed)
+    speed = min(options.speed, _STROKE_SPEED)
+    loads = [
+        one.inwards + min(_TIGHT * float(T0), 0.5 * setup.tension_max) / curve.gain
+        for one, curve, T0 in zip(found, setup.curves, arm.T0, strict=True)
+    ]
+    yield Move(tuple(at - _LOOSE_M for at in knees), options.speed)
+    first: Trace = yield Move(tuple(at + _FARTHEST_M for at in knees), speed, Stop(None, sum(loads) / setup.n))
+    if not first.stopped:
+        raise Refused(
+            f"the tendons do not get tight together within {1e3 * _FARTHEST_M:.0f} mm: is one of them caught, or is "
+            "arm.tendons not this arm's?"
+        )
+    tight = first.samples[-1].wound
+    stroke = (_TIGHT * float(arm.T0.max())) / float(arm.k_T.min()) + _LOOSE_M
+    loose = tuple(wound - stroke for wound in tight)
+    span = 2.0 * (_TIGHT - 1.0) * float(np.mean(arm.T0 / arm.k_T))
+    even = balanced(arm.H)
+    even = even @ even.T  # what of a change makes tendons tighter without bending the arm
     x: list[Array] = []
     y: list[Array] = []
-    for _ in range(_STROKES):
-        for goal, inwards in ((tight, True), (loose, False)):
-            trace: Trace = yield Move(goal, min(options.speed, _STROKE_SPEED))
-            for sample in trace.samples[_LEAD:-_LEAD]:
-                force = [
-                    setup.curves[i].gain
-                    * (sample.voltage[i] / setup.curves[i].volts)
-                    * (sample.load[i] - (one.inwards if inwards else one.outwards))
-                    for i, one in enumerate(found)
-                ]
-                x.append(np.asarray(sample.wound))
-                y.append(np.asarray(force))
-    return _solve(setup, found, np.asarray(knees), np.asarray(x), np.asarray(y))
+    for stroke_number in range(_STROKES):
+        for goal, inwards in ((loose, False), (tight, True)):
+            trace: Trace = yield Move(goal, speed)
+            inside = trace.samples[_LEAD:-_LEAD]
+            wound = np.array([sample.wound for sample in inside])
+            force = np.array([_forces(setup, found, sample, inwards=inwards) for sample in inside])
+            # about as far below the pretension as above: then the stiffness hardly matters
+            taut = wound.mean(axis=1) > sum(tight) / setup.n - span if len(inside) else np.zeros(0, dtype=np.bool_)
+            if stroke_number >= _FIRST_STROKES:
+                x.append(wound[taut])
+                y.append(force[taut])
+        if stroke_number < _FIRST_STROKES and taut.any():
+            # one pair may be tight before another is: even them out
+            at = np.asarray(tight) - wound[taut].mean(axis=0)
+            missing = even @ ((_TIGHT * arm.T0 - force[taut].mean(axis=0)) / arm.k_T - at)
+            change = np.clip(missing, -_FARTHEST_M, _FARTHEST_M / 4)
+            tight = tuple((np.asarray(tight) + change).tolist())
+            loose = tuple((np.asarray(loose) + change).tolist())
+    return _solve(setup, found, np.asarray(knees), np.concatenate(x), np.concatenate(y))
+
+
+def _forces(setup: Setup, found: Sequence[Found], sample: Sample, *, inwards: bool) -> list[float]:
+    """Tensions (n,), N, while all servos turn one way."""
+    return [
+        curve.gain * (volts / curve.volts) * (load - (one.inwards if inwards else one.outwards))
+        for curve, one, load, volts in zip(setup.curves, found, sample.load, sample.voltage, strict=True)
+    ]
 
 
 def _solve(setup: Setup, found: Sequence[Found], knees: Array, x: Array, y: Array) -> tuple[Array, Array]:
@@ -254,9 +283,8 @@ def _solve(setup: Setup, found: Sequence[Found], knees: Array, x: Array, y: Arra
     """
     arm = setup.arm
     stretch = arm.T0 / arm.k_T  # from the knee to the pretension, for the arm held straight
-    taut = x.mean(axis=1) > float(np.mean(knees + _LINE_FROM * stretch))
-    count = int(taut.sum())
-    tension = y[taut].mean(axis=0) if count else np.zeros(setup.n)
+    count = len(y)
+    tension = y.mean(axis=0) if count else np.zeros(setup.n)
     if count < _LEAST_TAUT or tension.min() < _LEAST_SHARE * float(arm.T0.min()):
         weakest = int(np.argmin(tension))
         raise Refused(
@@ -264,10 +292,12 @@ def _solve(setup: Setup, found: Sequence[Found], knees: Array, x: Array, y: Arra
             f"{float(arm.T0[weakest]):.1f} N were expected: is a tendon caught, or is arm.tendons not this arm's?"
         )
     N = balanced(arm.H)
-    together = N.T @ (x[taut].mean(axis=0) - (tension - arm.T0) / arm.k_T)
+    together = N.T @ (x.mean(axis=0) - (tension - arm.T0) / arm.k_T)
     noise = np.array([curve.gain * one.noise for curve, one in zip(setup.curves, found, strict=True)])
-    # of the readings here, of the slack servos' loads before, and of the stiffness that is taken for granted
-    spread = np.hypot(noise * math.sqrt(1.0 / count + 1.0 / _LEVEL_READINGS), _STIFFNESS_SPREAD * (tension - arm.T0))
+    # of the readings here, of the slack servos' loads before, of the gain, and of the stiffness taken for granted
+    readings = noise * math.sqrt(1.0 / count + 1.0 / _LEVEL_READINGS)
+    gain = np.array([curve.gain_sigma for curve in setup.curves]) * arm.T0
+    spread = np.sqrt(readings**2 + gain**2 + (_STIFFNESS_SPREAD * (tension - arm.T0)) ** 2)
     together_sigma = np.sqrt(N.T**2 @ np.square(spread / arm.k_T))
     alone_sigma = np.array([one.sigma for one in found])
     return combine(knees + stretch, alone_sigma, N, together, together_sigma)

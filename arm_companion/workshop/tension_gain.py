@@ -69,7 +69,7 @@ class Bench:
     """How the tensions are made."""
 
     scale: bool = False  # a spring scale in N, read on the way; otherwise weights in kg
-    travel: float = 0.01  # m
+    travel: float = 0.02  # m
     speed: float = 0.004  # m/s
     tension_max: float = 45.0  # N
 

@@ -64,6 +64,28 @@ def test_the_perch_is_held_by_contact_in_the_plant_and_within_all_limits() -> No
     assert not any(s.truth.body_contact for s in result.flight.samples if s.state.position_w[2] < -0.5)
 
 
+def test_load_and_statics_agree_all_along_the_undisturbed_flight() -> None:
+    result, _ = perch()
+    assert not any(suspect.fault for record in result.records[::20] for suspect in record.state.watch)
+
+
+def test_load_and_statics_together_know_the_free_arms_tensions_better_than_loads_alone() -> None:
+    """Against the plant's truth, while the arm hangs ready: the loads alone are off by the friction of the gears."""
+    result, _ = perch()
+    ready = [r for r in result.records if r.state.phase.name == "READY"]
+    fused, alone = [], []
+    for record in ready[::50]:
+        truth = result.flight.sample_at(record.t)
+        if truth is None:
+            continue
+        for i, tension in enumerate(truth.truth.tension):
+            estimate, tendon = record.commands.tensions[i], record.facts.tendons[i]
+            assert abs(estimate.tension - tension) < 4.0 * estimate.sigma
+            fused.append((estimate.tension - tension) ** 2)
+            alone.append((tendon.tension - tension) ** 2)
+    assert sum(fused) < 0.25 * sum(alone)
+
+
 def test_the_anchored_vehicle_goes_where_it_is_pulled() -> None:
     _, verdict = perch()
     pull = {move.name: move for move in verdict.moves}
@@ -134,6 +156,18 @@ def test_a_dead_servo_during_the_approach_ends_it_and_the_vehicle_comes_home() -
     assert "tendon 2" in " ".join(text for _, text in result.flight.texts)
     assert "PERCHED" not in phases(result)
     assert "did not land" not in verdict.reason
+
+
+@pytest.mark.scenario
+def test_a_tendon_that_is_cut_is_found_when_the_arm_bends_and_the_perch_given_up() -> None:
+    result, verdict = fly(lambda world: world.at(20.0, lambda w: w.plant.cut_tendon(0)))
+    assert not verdict.success
+    assert "PERCHED" not in phases(result)
+    assert "tendon 1 broken" in "".join(text for _, text in result.flight.texts)
+    assert phases(result)[-5:] == ["UNLOAD", "RELEASE", "DEPART", "STOWING", "STOWED"]
+    assert "did not land" not in verdict.reason
+    found = next(record for record in result.records if any(w.broken for w in record.state.watch))
+    assert found.state.phase.name in {"WRAP", "UNLOAD"}
 
 
 @pytest.mark.scenario

@@ -130,7 +130,7 @@ def test_a_servo_that_was_turned_without_power_is_refused_with_how_far() -> None
     lost = (*SERVOS[:1], dataclasses.replace(SERVOS[1], position=300, turns_lost=True), *SERVOS[2:])
     verdict = judge(calibration(), config(), INFO, lost, {2: 4096 + 100})
     assert verdict.state is CalibrationState.STALE
-    assert "servo 2 (tendon 2) was turned by 200 ticks" in verdict.refusal
+    assert "servo 2 (tendon 2) was turned by 200 ticks without power" in verdict.refusal
     assert "lost its turns" in judge(calibration(), config(), INFO, lost, {}).refusal
 
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from arm_companion.config.schema import LimitsConfig, ServosConfig
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.tendons import Tendons
+from arm_companion.errors import ConfigError
 from arm_companion.protocol.control_table import TICK_RAD
 
 SERVOS = ServosConfig(directions=(1, -1, 1, -1), zero_ticks=(2048, -3000, 0, 90_000))
@@ -194,3 +195,34 @@ def test_no_request_breaks_a_limit(story: list[tuple[tuple[float, ...], float, l
             assert abs(new) <= LIMITS.pull_max_m + 1e-5
             assert abs(new - old) <= step + 2e-5
         before = pulls
+
+
+# Coupling.
+
+ROWS = ((1.0, 0.0, 0.0, 0.0), (0.5, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, -0.3), (0.0, 0.0, 0.2, 1.0))
+COUPLED = dataclasses.replace(SERVOS, coupling=ROWS)
+
+
+@given(st.lists(st.floats(-0.05, 0.05), min_size=4, max_size=4))
+def test_goals_of_coupled_tendons_come_back_as_their_displacements(wanted: list[float]) -> None:
+    t = Tendons(COUPLED, dataclasses.replace(LIMITS, pull_speed_m_per_s=1.0), RADIUS)
+    t.states(servos())
+    t.goals((0.0,) * 4, 0.0)
+    goals = t.goals(wanted, 0.1)
+    states = t.states([dataclasses.replace(STATE, id=i + 1, position=goal) for i, goal in enumerate(goals)])
+    assert [state.pull for state in states] == pytest.approx(wanted, abs=3e-5)
+
+
+def test_coupled_tensions_do_the_work_that_the_servos_do() -> None:
+    t = Tendons(COUPLED, LIMITS, RADIUS)
+    states = t.states(servos(loads=(0.3, 0.2, 0.2, 0.25)))
+    pulleys = [sum(ROWS[j][i] * states[j].tension for j in range(4)) for i in range(4)]
+    gain = SERVOS.load_torque_nm / RADIUS
+    assert pulleys == pytest.approx([0.3 * gain, 0.2 * gain, 0.2 * gain, 0.25 * gain])
+    assert all(state.tension_sigma >= state.tension_bias > 0.0 for state in states)
+
+
+@pytest.mark.parametrize("rows", [((1.0, 0.0),), ((0.0,) * 4,) * 4, ((1.0, 1.0, 0.0, 0.0),) * 4])
+def test_a_coupling_that_cannot_be_inverted_is_refused(rows: tuple[tuple[float, ...], ...]) -> None:
+    with pytest.raises(ConfigError, match="coupling"):
+        dataclasses.replace(SERVOS, coupling=rows)
