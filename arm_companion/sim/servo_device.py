@@ -102,6 +102,11 @@ class EmulatedServo:
         return self.values[ct.ID.address]
 
     @property
+    def firmware(self) -> int:
+        """Version of its firmware."""
+        return self.values[ct.FIRMWARE_VERSION.address]
+
+    @property
     def baud(self) -> int:
         """Speed at which it listens."""
         return ct.BAUD_CODES[self.values[ct.BAUD_RATE.address]]

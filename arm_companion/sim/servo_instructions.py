@@ -73,7 +73,7 @@ def _sync_read(packet: Packet, listening: dict[int, EmulatedServo], chained: boo
     blocks: list[tuple[EmulatedServo, int, bytes]] = []
     for servo_id in wanted:
         servo = listening.get(servo_id)
-        if servo is not None and fast and servo.peek(ct.FIRMWARE_VERSION) < ct.FIRST_FIRMWARE_WITH_FAST_SYNC_READ:
+        if servo is not None and fast and servo.firmware < ct.FIRST_FIRMWARE_WITH_FAST_SYNC_READ:
             servo = None
         if servo is None or servo.silenced or servo.peek(ct.STATUS_RETURN_LEVEL) == 0:
             if chained or fast:
