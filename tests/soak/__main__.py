@@ -8,7 +8,6 @@ and a case is told by the seed and number printed with it.
 import argparse
 import collections
 import contextlib
-import dataclasses
 import importlib.util
 import json
 import re
@@ -26,7 +25,7 @@ from arm_companion.errors import ModelError
 from tests.soak.cases import Case, cases
 from tests.soak.check import PIECES, Asked, Defects, defects
 
-PLAIN = 5e-4  # relative defect of loads and support that an answer may have
+PLAIN = 1e-6  # relative defect of loads and support that an answer may have
 SHARP, TIGHT = 5e-3, 1e-3  # of moment and tension: above it the answer is compared with a much finer one
 WRONG = 0.01  # of base wrench and tensions
 HOPELESS = 0.03  # of anything: no answer that others could be compared with
@@ -48,7 +47,7 @@ class Tally:
     seconds: float = 0.0
 
     def plain(self) -> dict[str, Any]:
-        return dataclasses.asdict(self)
+        return {**vars(self), "refused": dict(self.refused)}
 
 
 def ask(model: RodModel, asked: Asked, start: ArmSolution | None = None) -> ArmSolution:

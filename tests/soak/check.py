@@ -79,6 +79,8 @@ def defects(asked: Asked, solution: ArmSolution, pieces: int = PIECES) -> Defect
         edges = before + np.linspace(0, length, pieces + 1)
         h = length / pieces
         R, p = solution.detail.sections(edges)
+        if before + length > s_end - 1e-12:  # the end is known better than the interpolated shape
+            R[-1], p[-1] = solution.tip_rotation, solution.tip_position
         inner = (edges[:-1, None] + 0.5 * h * (x + 1)).ravel()
         at = solution.detail.sections(inner)[1].reshape(pieces, FINE, 3)
         piece = segment.line_mass * 0.5 * h * np.einsum("f,kfi->ki", w, at)
@@ -101,14 +103,14 @@ def defects(asked: Asked, solution: ArmSolution, pieces: int = PIECES) -> Defect
         if before < s_end - 1e-12:
             mass += segment.end_mass
             first = first + segment.end_mass * p[-1]
-        end_m, R_tip, p_tip = m[-1], R[-1], p[-1]
+        end_m = m[-1]
     if before < s_end - 1e-9:
         raise ValueError("the solution is longer than the arm")
     return Defects(
         moment=wrong_moment / largest,
-        tip=_tip(asked, solution, N0 - mass * g, end_m, R_tip),
+        tip=_tip(asked, solution, N0 - mass * g, end_m, solution.tip_rotation),
         tendon=_tendons(asked, solution, longer),
-        support=max(_support(asked, R_tip, p_tip), float(np.abs(p_tip - solution.tip_position).max())) / s_end,
+        support=_support(asked, solution.tip_rotation, solution.tip_position) / s_end,
     )
 
 
