@@ -11,6 +11,7 @@ from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.world import World
 
 
+@pytest.mark.scenario
 def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     config = load("sim.toml")
     calls = 0
