@@ -7,6 +7,7 @@ import numpy as np
 
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
+from arm_companion.mission.hazards import astray
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
@@ -62,6 +63,8 @@ def prepare(s: Situation) -> State:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
             # from where the arm really is, so that torque coming on never jerks it
             bend = s.bend if _at_rest(s) else state.bend
+            if state.phase is Phase.STOWING and state.reference is not None and astray(s) is not None:
+                state = dataclasses.replace(state, reference=_here(s))  # it stays where it is if it follows again
             return dataclasses.replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
             return dataclasses.replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
@@ -249,7 +252,7 @@ def _lean(s: Situation) -> Vec3:
     """The acceleration fed forward, moved towards what the prediction asks for; zero where it asks for nothing."""
     prediction = s.state.prediction
     wanted = ZERO
-    if s.state.phase is Phase.PERCHED and prediction is not None:
+    if s.state.phase is Phase.PERCHED and s.state.feedforward and prediction is not None:
         wanted = clip_norm(add(prediction.lean, (0.0, 0.0, _trim(s))), s.config.limits.feedforward_m_per_s2)
     return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), _LEAN_RATE * s.dt))
 

@@ -89,6 +89,7 @@ class Order(enum.Enum):
     ABORT = "abort"
     JOG = "jog"
     CLEAR_ERRORS = "clear_errors"
+    FEEDFORWARD = "feedforward"
 
 
 @dataclass(frozen=True, slots=True)
@@ -221,12 +222,18 @@ class ArmFault(enum.IntFlag):
     NONE = 0
     VEHICLE_LOST = 1
     VEHICLE_STATE_STALE = 2
+    ESTIMATOR_JUMP = 4
     PILOT_TOOK_OVER = 8
     AUTOPILOT_FAILSAFE = 16
     DISARMED = 32
+    SETPOINT_REJECTED = 64
+    GROUND_LOST = 128
     OPERATOR_ABORT = 256
     SERVO_SILENT = 512
     SERVO_FAULT = 1024
+    OVERHEAT = 2048
+    OVERLOAD = 4096
+    LOW_VOLTAGE = 8192
     TENDON_SLACK = 16384
     TENDON_OVER_TENSION = 32768
     TENDON_BROKEN = 65536
@@ -235,8 +242,10 @@ class ArmFault(enum.IntFlag):
     SLIP = 1048576
     GRIP_TEST_FAILED = 2097152
     WRENCH_LIMIT = 4194304
+    MODEL = 8388608
     TIMEOUT = 16777216
     NOT_CALIBRATED = 33554432
+    CYCLE_OVERRUN = 67108864
     RESTARTED = 536870912
 
 
