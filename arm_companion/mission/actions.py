@@ -63,8 +63,6 @@ def prepare(s: Situation) -> State:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
             # from where the arm really is, so that torque coming on never jerks it
             bend = s.bend if _at_rest(s) else state.bend
-            if state.phase is Phase.STOWING and state.reference is not None and astray(s) is not None:
-                state = dataclasses.replace(state, reference=_here(s))  # it stays where it is if it follows again
             return dataclasses.replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
             return dataclasses.replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
@@ -163,6 +161,8 @@ def _reference(s: Situation) -> Reference | None:
         return _here(s)
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:
+        if astray(s) is not None:
+            return _here(s)  # a vehicle that follows again stays where it is
         return dataclasses.replace(reference, velocity=ZERO)
     if state.phase in (Phase.WRAP, Phase.RELEASE):
         return Reference(_beside_bar(s), ZERO, state.heading)
