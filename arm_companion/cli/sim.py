@@ -135,7 +135,10 @@ def _trials(arguments: argparse.Namespace, config: Config) -> int:
 
     started = time.perf_counter()
     stream = sys.stderr if arguments.json else sys.stdout
-    summary = fly(config, arguments.trials, arguments.jobs, lambda outcome: show_outcome(outcome, stream))
+    seeds = range(config.sim.seed, config.sim.seed + arguments.trials)
+    summary = fly(
+        arguments.config, arguments.settings, seeds, arguments.jobs, lambda outcome: show_outcome(outcome, stream)
+    )
     show_summary(summary, stream)
     if arguments.json:
         low, high = summary.interval

@@ -9,13 +9,13 @@ import math
 import multiprocessing
 import random
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from statistics import NormalDist
 
 from arm_companion.clock import run_simulated
-from arm_companion.config.schema import Config
+from arm_companion.config import Config, load
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.verdict import judge
 
@@ -177,8 +177,18 @@ def draw(config: Config, seed: int) -> Draw:
     return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, bar told {error} mm off")
 
 
-def fly_one(config: Config, seed: int) -> Outcome:
-    """One trial in simulated time, in this process."""
+def fly_one(file: str, settings: tuple[str, ...], seed: int) -> Outcome:
+    """One trial in simulated time, in this process.
+
+    Args:
+        file: configuration, read anew because a read one does not travel between processes.
+        settings: options that override it.
+        seed: of the trial.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+    config = load(file, settings)
     drawn = draw(config, seed)
     result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world))
     verdict = judge(result.flight, result.failure)
@@ -190,23 +200,29 @@ def fly_one(config: Config, seed: int) -> Outcome:
     return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words)
 
 
-def fly(config: Config, trials: int, jobs: int, told: Callable[[Outcome], None] = lambda _: None) -> Summary:
-    """All trials, with seeds from `sim.seed` upwards.
+def fly(
+    file: str,
+    settings: Sequence[str],
+    seeds: Sequence[int],
+    jobs: int,
+    told: Callable[[Outcome], None] = lambda _: None,
+) -> Summary:
+    """All trials, each in a process of `jobs`.
 
     Args:
-        config: of every trial, before it is drawn.
-        trials: how many.
+        file: configuration of every trial, before it is drawn.
+        settings: options that override it.
+        seeds: one for each trial.
         jobs: processes that fly at the same time.
         told: called with each outcome as it comes, in any order.
 
     Raises:
         BrokenProcessPool: a process died.
     """
-    seeds = range(config.sim.seed, config.sim.seed + trials)
     spawn = multiprocessing.get_context("spawn")
     outcomes: list[Outcome] = []
-    with ProcessPoolExecutor(min(jobs, trials), mp_context=spawn) as pool:
-        waiting = [pool.submit(fly_one, config, seed) for seed in seeds]
+    with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
+        waiting = [pool.submit(fly_one, file, tuple(settings), seed) for seed in seeds]
         try:
             for done in as_completed(waiting):
                 outcomes.append(done.result())
