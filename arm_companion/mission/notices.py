@@ -47,9 +47,9 @@ WARNINGS: tuple[Told, ...] = (
     ),
     Told(frozenset({Phase.PERCHED}), estimator_jumped, Severity.WARNING, "the arm holds on", ArmFault.ESTIMATOR_JUMP),
     Told(frozenset({Phase.HOLDING}), overstressed, Severity.CRITICAL, "the arm holds"),
-    Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, slack, Severity.WARNING),
+    Told(frozenset(Phase), slack, Severity.WARNING),
     Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "nothing is fed forward"),
     Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, ground_lost, Severity.WARNING, "the autopilot decides"),
-    Told(frozenset(Phase) - {Phase.STARTUP}, overrun, Severity.WARNING, error=ArmFault.CYCLE_OVERRUN),
+    Told(frozenset(Phase), overrun, Severity.WARNING, error=ArmFault.CYCLE_OVERRUN),
 )
 """What a person must know and no transition tells."""
