@@ -8,10 +8,12 @@ import math
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from arm_companion.arm.model import ArmSolution, Hold
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import ModelError
 from arm_companion.mission.facts import (
@@ -36,10 +38,14 @@ Hovering = Callable[..., Facts]
 class Blind(RodModel):
     """Mechanics that never find a solution."""
 
-    def free(self, *_: object, **__: object) -> object:  # type: ignore[override]
+    def free(self, *_: Any, **__: Any) -> ArmSolution:
         raise ModelError("none")
 
-    held = anchor = free  # type: ignore[assignment]
+    def held(self, *_: Any, **__: Any) -> ArmSolution:
+        raise ModelError("none")
+
+    def anchor(self, *_: Any, **__: Any) -> Hold:
+        raise ModelError("none")
 
 
 @dataclasses.dataclass(frozen=True)

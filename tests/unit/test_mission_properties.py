@@ -158,6 +158,9 @@ def test_nothing_that_can_be_seen_or_ordered_makes_an_exception_or_an_illegal_co
 # What the tables themselves promise.
 
 
+FLYING = [phase for phase in Phase if phase in MOVES_VEHICLE]
+
+
 def _rows() -> list[Transition[Phase, Situation] | OrderRow[Phase, Situation]]:
     return [*TABLE.transitions, *TABLE.orders]
 
@@ -177,7 +180,7 @@ def test_every_phase_can_be_reached() -> None:
     assert _reachable(Phase.STARTUP) == set(Phase)
 
 
-@pytest.mark.parametrize("phase", sorted(MOVES_VEHICLE, key=lambda p: p.value), ids=lambda phase: phase.name)
+@pytest.mark.parametrize("phase", FLYING, ids=lambda phase: phase.name)
 def test_every_live_phase_can_abort_and_the_abort_ends_at_rest_or_holding(phase: Phase) -> None:
     row = TABLE.order(Order.ABORT, phase)
     assert row is not None
@@ -186,7 +189,7 @@ def test_every_live_phase_can_abort_and_the_abort_ends_at_rest_or_holding(phase:
         assert any(phase in row.sources and row.target is not phase for row in TABLE.transitions)
 
 
-@pytest.mark.parametrize("phase", sorted(MOVES_VEHICLE, key=lambda p: p.value), ids=lambda phase: phase.name)
+@pytest.mark.parametrize("phase", FLYING, ids=lambda phase: phase.name)
 def test_every_phase_that_moves_the_vehicle_has_an_answer_to_its_loss(phase: Phase) -> None:
     labels = {row.label for row in TABLE.transitions if phase in row.sources}
     if phase is Phase.RELEASE:
