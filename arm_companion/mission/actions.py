@@ -155,8 +155,10 @@ def _here(s: Situation) -> Reference:
 def _reference(s: Situation) -> Reference | None:
     """The vehicle's reference after this cycle."""
     state = s.state
-    if not state.streaming or not s.vehicle_fresh:
-        return state.reference  # frozen: acting on old state is worse than waiting
+    if not state.streaming:
+        return state.reference
+    if not s.vehicle_fresh:  # frozen, and at rest: acting on old state is worse than waiting
+        return None if state.reference is None else dataclasses.replace(state.reference, velocity=ZERO)
     if not (s.external and s.wants_stream):
         return _here(s)
     reference = state.reference or _here(s)

@@ -71,7 +71,12 @@ CAUSES: tuple[Cause, ...] = (
         (hazards.failsafe,),
         "no set-points; goes on with the arm alone",
     ),
-    Cause("disarm", ArmFault.DISARMED, (hazards.disarmed,), "no set-points; goes on with the arm alone"),
+    Cause(
+        "disarm",
+        ArmFault.DISARMED,
+        (hazards.disarmed, hazards.motors_stopped),
+        "no set-points; goes on with the arm alone",
+    ),
     Cause(
         "ground station lost",
         ArmFault.GROUND_LOST,

@@ -3,6 +3,8 @@
 What lasts before it counts has its timer in `vigil`.
 """
 
+import math
+
 from arm_companion.mission.facts import Control
 from arm_companion.mission.motion import norm, sub
 from arm_companion.mission.situation import Situation
@@ -31,8 +33,14 @@ def failsafe(s: Situation) -> str | None:
 
 
 def disarmed(s: Situation) -> str | None:
-    """The motors stopped."""
-    return "the vehicle is disarmed" if not s.facts.vehicle.armed else None
+    """The motors stand. Of an autopilot that has not been heard yet, nobody knows."""
+    vehicle = s.facts.vehicle
+    return "the vehicle is disarmed" if not vehicle.armed and vehicle.heartbeat_age_s < math.inf else None
+
+
+def motors_stopped(s: Situation) -> str | None:
+    """The motors stopped in this cycle; a vehicle that stood before is let go when a person says so."""
+    return disarmed(s) if s.state.armed else None
 
 
 def vehicle_lost(s: Situation) -> str | None:
@@ -142,7 +150,7 @@ def model_blind(s: Situation) -> str | None:
 def ground_lost(s: Situation) -> str | None:
     """No ground station that may command has been heard for a while, though one was."""
     age = s.facts.ground_age_s
-    return f"ground station silent for {_GROUND_LOST_S:g} s" if _GROUND_LOST_S < age < float("inf") else None
+    return f"ground station silent for {_GROUND_LOST_S:g} s" if _GROUND_LOST_S < age < math.inf else None
 
 
 def overrun(s: Situation) -> str | None:

@@ -71,6 +71,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         t=t,
         prediction=prediction,
         control=facts.vehicle.control,
+        armed=facts.vehicle.armed,
     )
     commands = Commands(
         arm,

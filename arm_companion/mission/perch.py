@@ -13,6 +13,7 @@ from arm_companion.mission.hazards import (
     grip_lost,
     hot,
     low_voltage,
+    motors_stopped,
     overstressed,
     pilot_takes_over,
     servo_fault,
@@ -292,12 +293,13 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.UNLOAD}), vehicle_lost, Phase.HOLDING, "vehicle lost", ArmFault.VEHICLE_LOST),
         Row(FREE_FLIGHT | {Phase.DEPART}, disarmed, Phase.STOWING, "disarmed", ArmFault.DISARMED),
         Row(
-            GRASPING | GRIPPED | {Phase.UNLOAD, Phase.RELEASE},
+            GRASPING | GRIPPED | {Phase.UNLOAD},
             disarmed,
             Phase.HOLDING,
             "disarmed",
             ArmFault.DISARMED,
         ),
+        Row(frozenset({Phase.RELEASE}), motors_stopped, Phase.HOLDING, "motors stop", ArmFault.DISARMED),
         # then where it is: a jump moves all that is remembered, so a grip that is tested already stays
         Row(
             FREE_FLIGHT | {Phase.DEPART},

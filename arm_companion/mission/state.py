@@ -136,6 +136,7 @@ class State:
     t: float = 0.0  # loop time of the previous step
     running: Running | None = None
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
+    armed: bool = False  # of the previous step, to see the motors stop
     streaming: bool = False  # set-points go out
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad

@@ -30,6 +30,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "t": T0,
         "since": T0 - 0.1,
         "control": Control.EXTERNAL,
+        "armed": True,
         "streaming": phase is not Phase.STARTUP,
         "reference": Reference(PLACE),
         "position": PLACE,

@@ -220,6 +220,24 @@ def test_a_grip_is_never_opened_while_the_motors_stand_or_nobody_is_heard(
         assert all(said.pulls is None for said in run.said[1:])
 
 
+def test_motors_that_stop_while_the_arm_lets_go_stop_that_too(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(memory(Phase.RELEASE), parameters)
+    run.cycles(hovering(BENT), 0.5)
+    run.cycles(hovering(BENT, armed=False), 1.0)
+    assert run.phases == [Phase.RELEASE, Phase.HOLDING]
+
+
+@pytest.mark.parametrize("vehicle", [{"armed": False}, {"armed": False, "heartbeat_age_s": math.inf}])
+def test_a_person_may_let_go_of_a_bar_while_the_vehicle_stands_or_has_not_been_heard_yet(
+    vehicle: dict[str, object], parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = hovering(BENT, **vehicle)
+    run = Run(memory(Phase.HOLDING, armed=False, control=facts.vehicle.control), parameters)
+    run.cycles(facts, 0.2)
+    run.cycles(ask(facts, Order.RELEASE), 1.0)
+    assert run.phases == [Phase.HOLDING, Phase.RELEASE]
+
+
 @pytest.mark.parametrize("fault", ["servo silent", "low voltage", "servo overheats (warning)", "tendon broken"])
 def test_a_perched_arm_with_a_failing_part_holds_until_a_person_lets_it_go(
     fault: str, parameters: Parameters, hovering: Hovering

@@ -196,4 +196,4 @@ def test_every_phase_that_moves_the_vehicle_has_an_answer_to_its_loss(phase: Pha
         assert "vehicle not ours" in labels, "half a grip is no grip: it goes on opening, and leaves the vehicle alone"
     else:
         assert "vehicle lost" in labels
-    assert "disarmed" in labels
+    assert labels & {"disarmed", "motors stop"}
