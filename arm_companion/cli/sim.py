@@ -5,6 +5,7 @@ import asyncio
 import importlib.util
 import json
 import math
+import os
 import sys
 import time
 from pathlib import Path
@@ -27,6 +28,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_config_arguments(parser, default="sim.toml")
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
+    parser.add_argument(
+        "--trials",
+        type=_count,
+        metavar="N",
+        help="fly N drawn worlds (bar, wind, masses, stiffness, friction), with seeds from --seed upwards; "
+        "needs --simulated; exit code 0 only when all succeed",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=_count,
+        metavar="N",
+        default=os.cpu_count() or 1,
+        help="processes that fly trials at the same time (default: one a processor)",
+    )
     parser.add_argument("--json", action="store_true", help="print the verdict as one JSON object on the last line")
     parser.add_argument(
         "--output",
@@ -40,8 +55,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _count(text: str) -> int:
+    """A whole number from 1 upwards."""
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"{number} is not 1 or more")
+    return number
+
+
 def run(arguments: argparse.Namespace) -> int:
     """Fly the scenario; exit code 0 only when it perched and let go."""
+    if arguments.trials is not None and not (arguments.simulated and arguments.scenario == "perch"):
+        print("arm-companion sim: --trials flies the perch in simulated time: sim perch --simulated", file=sys.stderr)
+        return 2
     for name in ("matplotlib", "mujoco", "rich"):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
@@ -49,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.seed is not None:
         arguments.settings.append(f"sim.seed={arguments.seed}")
     config = load_from(arguments)
+    if arguments.trials is not None:
+        return _trials(arguments, config)
     arguments.output.mkdir(parents=True, exist_ok=True)
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
 
@@ -99,6 +127,33 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
         wall = time.perf_counter() - started
         print(json.dumps(_summary(verdict, result, wall)))
     return 0 if verdict.success else 1
+
+
+def _trials(arguments: argparse.Namespace, config: Config) -> int:
+    from arm_companion.sim.progress import show_outcome, show_summary  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.trials import fly  # noqa: PLC0415
+
+    started = time.perf_counter()
+    stream = sys.stderr if arguments.json else sys.stdout
+    seeds = range(config.sim.seed, config.sim.seed + arguments.trials)
+    summary = fly(
+        arguments.config, arguments.settings, seeds, arguments.jobs, lambda outcome: show_outcome(outcome, stream)
+    )
+    show_summary(summary, stream)
+    if arguments.json:
+        low, high = summary.interval
+        contract = {
+            "scenario": "perch",
+            "success": summary.success,
+            "trials": len(summary.outcomes),
+            "failures": summary.failures,
+            "interval_95": [round(low, 4), round(high, 4)],
+            "harmed": summary.harmed,
+            "seed": config.sim.seed,
+            "wall_s": round(time.perf_counter() - started, 3),
+        }
+        print(json.dumps(contract))
+    return 0 if summary.success == len(summary.outcomes) else 1
 
 
 def _record_path(arguments: argparse.Namespace) -> Path:

@@ -7,6 +7,7 @@ import numpy as np
 
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
+from arm_companion.mission.hazards import astray
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
@@ -154,12 +155,16 @@ def _here(s: Situation) -> Reference:
 def _reference(s: Situation) -> Reference | None:
     """The vehicle's reference after this cycle."""
     state = s.state
-    if not state.streaming or not s.vehicle_fresh:
-        return state.reference  # frozen: acting on old state is worse than waiting
+    if not state.streaming:
+        return state.reference
+    if not s.vehicle_fresh:  # frozen, and at rest: acting on old state is worse than waiting
+        return None if state.reference is None else dataclasses.replace(state.reference, velocity=ZERO)
     if not (s.external and s.wants_stream):
         return _here(s)
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:
+        if astray(s) is not None:
+            return _here(s)  # a vehicle that follows again stays where it is
         return dataclasses.replace(reference, velocity=ZERO)
     if state.phase in (Phase.WRAP, Phase.RELEASE):
         return Reference(_beside_bar(s), ZERO, state.heading)
@@ -249,7 +254,7 @@ def _lean(s: Situation) -> Vec3:
     """The acceleration fed forward, moved towards what the prediction asks for; zero where it asks for nothing."""
     prediction = s.state.prediction
     wanted = ZERO
-    if s.state.phase is Phase.PERCHED and prediction is not None:
+    if s.state.phase is Phase.PERCHED and s.state.feedforward and prediction is not None:
         wanted = clip_norm(add(prediction.lean, (0.0, 0.0, _trim(s))), s.config.limits.feedforward_m_per_s2)
     return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), _LEAN_RATE * s.dt))
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
-from arm_companion.mission.facts import ArmFault, Order
+from arm_companion.mission.facts import ArmFault, Order, Severity
 
 P = TypeVar("P", bound=enum.Enum)
 S = TypeVar("S")
@@ -57,6 +57,25 @@ class OrderRow(Generic[P, S]):
     target: P
     done: frozenset[P]
     refusal: Callable[[S], str | None] = lambda _: None
+
+
+@dataclass(frozen=True)
+class Warned(Generic[P, S]):
+    """What is told once in a phase and changes nothing.
+
+    Attributes:
+        phases: in which it is told.
+        guard: reason in words while it holds, else None.
+        severity: of the notice.
+        consequence: what follows, appended to the reason.
+        error: cause that stays in ARM_STATUS when it held for a cycle only.
+    """
+
+    phases: frozenset[P]
+    guard: Callable[[S], str | None]
+    severity: Severity
+    consequence: str = ""
+    error: ArmFault = ArmFault.NONE
 
 
 @dataclass(frozen=True)

@@ -20,14 +20,17 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
-from arm_companion.mission.perch import GRIPPED, TABLE, TENSE
+from arm_companion.mission.notices import WARNINGS
+from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
+from arm_companion.mission.vigil import keep_vigil
 from arm_companion.mission.wrench import predict
 
 _CLEAR_TIMEOUT_S = 6.0
+_BESIDE = frozenset({Order.JOG, Order.FEEDFORWARD})  # orders that leave the running one alone
 
 SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
 """What the servos do in each phase when the cycle itself fails or the daemon is told to stop.
@@ -64,11 +67,11 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
     situation = situation.remembering(state)
     prediction = predict(situation)
     state = dataclasses.replace(
-        state,
+        _warn(situation, notices),
         t=t,
         prediction=prediction,
         control=facts.vehicle.control,
-        warned=_warn(situation, notices),
+        armed=facts.vehicle.armed,
     )
     commands = Commands(
         arm,
@@ -87,6 +90,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
 
 def _estimate(s: Situation) -> State:
     """The observers after this cycle."""
+    s = s.remembering(keep_vigil(s))
     state, perch = s.state, s.config.perch
     expected = state.prediction.tensions if state.prediction is not None else ()
     force = (
@@ -128,15 +132,10 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         answers.append(Answer(request.id, result, rejected.reason))
         return s
     s = s.remembering(jogged)
-    if s.state.running is not None and request.order is not Order.JOG:
+    if s.state.running is not None and request.order not in _BESIDE:
         answers.append(Answer(s.state.running.request, Result.CANCELLED, f"{name} ordered"))
         s = s.remembering(dataclasses.replace(s.state, running=None))
-    if request.order is Order.READY:
-        s = s.remembering(dataclasses.replace(s.state, streaming=True, errors=ArmFault.NONE))
-    if request.order in {Order.PERCH, Order.CLEAR_ERRORS}:
-        s = s.remembering(dataclasses.replace(s.state, errors=ArmFault.NONE))
-    if request.order is Order.CLEAR_ERRORS:  # a person has looked at the tendons
-        s = s.remembering(dataclasses.replace(s.state, watch=()))
+    s = s.remembering(_settle(s.state, request))
     if row.target is not phase:
         aborted = ArmFault.OPERATOR_ABORT if request.order is Order.ABORT else ArmFault.NONE
         s = _enter(s, row.target, f"order {name}", notices, aborted)
@@ -145,6 +144,20 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         return s
     answers.append(Answer(request.id, Result.IN_PROGRESS, progress=0))
     return s.remembering(dataclasses.replace(s.state, running=Running(request.id, request.order, row.done, s.t)))
+
+
+def _settle(state: State, request: Request) -> State:
+    """What an order changes in memory besides the phase."""
+    match request.order:
+        case Order.READY:
+            return dataclasses.replace(state, streaming=True, errors=ArmFault.NONE)
+        case Order.PERCH:
+            return dataclasses.replace(state, errors=ArmFault.NONE)
+        case Order.CLEAR_ERRORS:  # a person has looked at the tendons
+            return dataclasses.replace(state, errors=ArmFault.NONE, watch=())
+        case Order.FEEDFORWARD:
+            return dataclasses.replace(state, feedforward=bool(request.parameters[0]))
+    return state
 
 
 def _begins_clearing(s: Situation) -> bool:
@@ -202,14 +215,16 @@ def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error
     return s.remembering(actions.prepare(s.remembering(state)))
 
 
-def _warn(s: Situation, notices: list[Notice]) -> frozenset[str]:
-    """Say once per phase what a person must know and no transition tells."""
-    warned = s.state.warned
-    for fault, phases in ((s.servo_fault, TENSE), (s.tendon_fault, GRIPPED | {Phase.HOLDING})):
-        if fault is not None and s.state.phase in phases and fault not in warned:
-            notices.append(Notice(Severity.CRITICAL, f"{fault}; the arm holds"))
-            warned |= {fault}
-    return warned
+def _warn(s: Situation, notices: list[Notice]) -> State:
+    """Say once per phase what a person must know and no transition tells; what the reason counts may go on changing."""
+    state = s.state
+    for told in WARNINGS:
+        name = told.guard.__name__
+        if state.phase not in told.phases or name in state.warned or (reason := told.guard(s)) is None:
+            continue
+        notices.append(Notice(told.severity, f"{reason}; {told.consequence}" if told.consequence else reason))
+        state = dataclasses.replace(state, warned=state.warned | {name}, errors=state.errors | told.error)
+    return state
 
 
 def _tensions(facts: Facts, state: State, prediction: Prediction) -> tuple[TensionEstimate, ...]:

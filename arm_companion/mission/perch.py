@@ -4,11 +4,28 @@ Abort rows stand first and therefore win. A row's guard returns its reason in wo
 """
 
 from arm_companion.mission.estimate import strength
-from arm_companion.mission.facts import ArmFault, Control, Order
+from arm_companion.mission.facts import ArmFault, Order
+from arm_companion.mission.hazards import (
+    astray,
+    disarmed,
+    estimator_jumped,
+    failsafe,
+    grip_lost,
+    hot,
+    low_voltage,
+    motors_stopped,
+    overstressed,
+    pilot_takes_over,
+    servo_fault,
+    tendon_broken,
+    tendon_jumped,
+    vehicle_lost,
+    wrench_over_limit,
+)
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, dot, norm, scale, sub
 from arm_companion.mission.situation import Situation, at
-from arm_companion.mission.state import Phase
+from arm_companion.mission.state import FOLLOWS, Phase
 
 Row = Transition[Phase, Situation]
 
@@ -28,52 +45,13 @@ _AT_BAR_M = 0.03
 _PROBE_S = 3.0
 _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
-_SLIP_M = 0.12
 _CLEAR_BEND_RAD = 0.25
 _READYING_S = 10.0
 _BAR_WITHIN_M = 50.0
 _BAR_LEVEL = 0.2  # sine of the steepest bar that an upright vehicle can wrap
 
 
-# --- guards: what can go wrong ---
-
-
-def pilot_takes_over(s: Situation) -> str | None:
-    """The autopilot left our mode: whoever did it, the vehicle is theirs."""
-    if s.external:
-        return None
-    if s.facts.vehicle.control is Control.FAILSAFE:
-        return f"autopilot failsafe (mode {s.facts.vehicle.mode})"
-    return f"the pilot has the vehicle (mode {s.facts.vehicle.mode})"
-
-
-def disarmed(s: Situation) -> str | None:
-    """The motors stopped."""
-    return "the vehicle is disarmed" if not s.facts.vehicle.armed else None
-
-
-def vehicle_lost(s: Situation) -> str | None:
-    """State or heartbeat of the vehicle is too old."""
-    v = s.facts.vehicle
-    if s.vehicle_fresh:
-        return None
-    age = max(v.position_age_s, v.attitude_age_s)
-    return f"vehicle state is {age:.2f} s old, heartbeat {v.heartbeat_age_s:.1f} s"
-
-
-def servo_fault(s: Situation) -> str | None:
-    """A servo is silent, reports a hardware error, or no longer knows its turns."""
-    return s.servo_fault
-
-
-def tendon_broken(s: Situation) -> str | None:
-    """A tendon carries nothing where the statics say that it must."""
-    return next((watched.broken for watched in s.state.watch if watched.broken), None)
-
-
-def tendon_jumped(s: Situation) -> str | None:
-    """A tendon's tension does not fit its displacement."""
-    return next((watched.jumped for watched in s.state.watch if watched.jumped), None)
+# --- guards: what did not come in time ---
 
 
 def _too_long(limit_s: float, what: str, s: Situation) -> str | None:
@@ -112,30 +90,6 @@ def pull_test_failed(s: Situation) -> str | None:
     if s.elapsed < _PROBE_S or share < s.config.perch.verify_give_share:
         return None
     return f"pull test failed: gave {share:.0%} of the asked move"
-
-
-def grip_lost(s: Situation) -> str | None:
-    """The vehicle is far from where the grip would have kept it."""
-    return f"grip lost: vehicle moved {s.slipped:.2f} m" if s.slipped > _SLIP_M else None
-
-
-def overstressed(s: Situation) -> str | None:
-    """A tendon carries more than its limit."""
-    most, limit = max(s.tensions), s.config.limits.tension_max_n
-    return f"tendon tension {most:.1f} N is over {limit:g} N" if most > limit else None
-
-
-def wrench_over_limit(s: Situation) -> str | None:
-    """The arm is predicted to push or twist the airframe harder than it may."""
-    prediction, limits = s.state.prediction, s.config.limits
-    if prediction is None or not prediction.wrench.valid:
-        return None
-    force, torque = norm(prediction.wrench.force_b), norm(prediction.wrench.torque_b)
-    if force > limits.wrench_force_n:
-        return f"{force:.1f} N on the airframe is over {limits.wrench_force_n:g} N"
-    if torque > limits.wrench_moment_nm:
-        return f"{torque:.2f} N m on the airframe is over {limits.wrench_moment_nm:g} N m"
-    return None
 
 
 # --- guards: what goes well ---
@@ -269,7 +223,7 @@ def cannot_perch(s: Situation) -> str | None:
         return f"the bar is {distance:.0f} m away; at most {_BAR_WITHIN_M:g} m are allowed"
     if abs(s.bar.axis_w[2]) > _BAR_LEVEL:
         return "the bar is not level"
-    return None
+    return hot(s) or low_voltage(s)
 
 
 def cannot_jog_vehicle(s: Situation) -> str | None:
@@ -303,6 +257,7 @@ ORDERS: tuple[Ask, ...] = (
     # servos may be rebooted and homed only where nothing hangs on them; `done` is when they are well
     Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset()),
     Ask(Order.CLEAR_ERRORS, STOWED_ONLY, Phase.STOWED, frozenset()),
+    *(Ask(Order.FEEDFORWARD, frozenset({phase}), phase, frozenset({phase})) for phase in Phase),
     *(
         # nothing is under way that could be given up, or it is being given up already
         Ask(Order.ABORT, frozenset({phase}), phase, frozenset({phase}))
@@ -316,44 +271,70 @@ ORDERS: tuple[Ask, ...] = (
     ),
 )
 
+_ENDS_A_BEGINNING = ((FREE_FLIGHT, Phase.DEPART), (GRASPING | {Phase.VERIFY}, Phase.UNLOAD))
+
 TABLE: Table[Phase, Situation] = Table(
     transitions=(
-        # aborts
+        # aborts: first whose vehicle it is
+        *(
+            Row(phases, guard, target, name, error)
+            for guard, name, error in (
+                (pilot_takes_over, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
+                (failsafe, "autopilot failsafe", ArmFault.AUTOPILOT_FAILSAFE),
+                (vehicle_lost, "vehicle lost", ArmFault.VEHICLE_LOST),
+            )
+            for phases, target in (
+                (FREE_FLIGHT | {Phase.DEPART}, Phase.STOWING),
+                (GRASPING, Phase.RELEASE),
+                (GRIPPED, Phase.HOLDING),
+            )
+        ),
+        # a grip that is about to be opened, with nobody known to fly: it may be all that holds the vehicle
+        Row(frozenset({Phase.UNLOAD}), vehicle_lost, Phase.HOLDING, "vehicle lost", ArmFault.VEHICLE_LOST),
+        Row(FREE_FLIGHT | {Phase.DEPART}, disarmed, Phase.STOWING, "disarmed", ArmFault.DISARMED),
+        Row(
+            GRASPING | GRIPPED | {Phase.UNLOAD},
+            disarmed,
+            Phase.HOLDING,
+            "disarmed",
+            ArmFault.DISARMED,
+        ),
+        Row(frozenset({Phase.RELEASE}), motors_stopped, Phase.HOLDING, "motors stop", ArmFault.DISARMED),
+        # then where it is: a jump moves all that is remembered, so a grip that is tested already stays
         Row(
             FREE_FLIGHT | {Phase.DEPART},
-            pilot_takes_over,
+            estimator_jumped,
             Phase.STOWING,
-            "pilot takes over",
-            ArmFault.PILOT_TOOK_OVER,
+            "estimator jump",
+            ArmFault.ESTIMATOR_JUMP,
         ),
-        Row(GRASPING, pilot_takes_over, Phase.RELEASE, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
-        Row(GRIPPED, pilot_takes_over, Phase.HOLDING, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
-        Row(FREE_FLIGHT | {Phase.DEPART}, vehicle_lost, Phase.STOWING, "vehicle lost", ArmFault.VEHICLE_LOST),
-        Row(GRASPING, vehicle_lost, Phase.RELEASE, "vehicle lost", ArmFault.VEHICLE_LOST),
-        Row(GRIPPED, vehicle_lost, Phase.HOLDING, "vehicle lost", ArmFault.VEHICLE_LOST),
-        Row(FREE_FLIGHT | {Phase.DEPART}, disarmed, Phase.STOWING, "disarmed", ArmFault.DISARMED),
-        Row(GRASPING | GRIPPED, disarmed, Phase.HOLDING, "disarmed", ArmFault.DISARMED),
-        Row(FREE_FLIGHT, servo_fault, Phase.DEPART, "servo fault", ArmFault.SERVO_FAULT),
-        Row(GRASPING | {Phase.VERIFY}, servo_fault, Phase.UNLOAD, "servo fault", ArmFault.SERVO_FAULT),
         Row(
-            frozenset({Phase.READYING, Phase.READY}),
-            servo_fault,
-            Phase.STOWING,
-            "servo fault",
-            ArmFault.SERVO_FAULT,
+            GRASPING | {Phase.VERIFY},
+            estimator_jumped,
+            Phase.UNLOAD,
+            "estimator jump",
+            ArmFault.ESTIMATOR_JUMP,
+        ),
+        Row(FOLLOWS, astray, Phase.STOWING, "set-points not followed", ArmFault.SETPOINT_REJECTED),
+        # then the arm: nothing new is begun with it, and a grip that is tested already stays until a person says
+        *(
+            Row(phases, guard, target, name, error)
+            for guard, name, error in (
+                (servo_fault, "servo fault", ArmFault.SERVO_FAULT),
+                (tendon_broken, "tendon broken", ArmFault.TENDON_BROKEN),
+                (tendon_jumped, "tendon jumped", ArmFault.TENSION_DISAGREES),
+            )
+            for phases, target in (*_ENDS_A_BEGINNING, (frozenset({Phase.READYING, Phase.READY}), Phase.STOWING))
         ),
         *(
             Row(phases, guard, target, name, error)
             for guard, name, error in (
-                (tendon_broken, "tendon broken", ArmFault.TENDON_BROKEN),
-                (tendon_jumped, "tendon jumped", ArmFault.TENSION_DISAGREES),
+                (hot, "servo hot", ArmFault.OVERHEAT),
+                (low_voltage, "low voltage", ArmFault.LOW_VOLTAGE),
             )
-            for phases, target in (
-                (FREE_FLIGHT, Phase.DEPART),
-                (GRASPING | {Phase.VERIFY}, Phase.UNLOAD),
-                (frozenset({Phase.READYING, Phase.READY}), Phase.STOWING),
-            )
+            for phases, target in _ENDS_A_BEGINNING
         ),
+        Row(FREE_FLIGHT, overstressed, Phase.DEPART, "over-tension", ArmFault.TENDON_OVER_TENSION),
         Row(GRASPING | GRIPPED, overstressed, Phase.UNLOAD, "over-tension", ArmFault.TENDON_OVER_TENSION),
         Row(GRIPPED, wrench_over_limit, Phase.UNLOAD, "wrench limit", ArmFault.WRENCH_LIMIT),
         Row(frozenset({Phase.PERCHED}), grip_lost, Phase.UNLOAD, "grip lost", ArmFault.SLIP),
@@ -366,7 +347,7 @@ TABLE: Table[Phase, Situation] = Table(
         ),
         # progress
         Row(frozenset({Phase.STARTUP}), straight_at_start, Phase.STOWED, "arm at rest"),
-        Row(frozenset({Phase.STARTUP}), bent_at_start, Phase.HOLDING, "arm holds something"),
+        Row(frozenset({Phase.STARTUP}), bent_at_start, Phase.HOLDING, "arm holds something", ArmFault.RESTARTED),
         Row(frozenset({Phase.READYING}), pose_checked, Phase.READY, "pose checked"),
         Row(frozenset({Phase.APPROACH}), at_standoff, Phase.REACH, "at stand-off"),
         Row(frozenset({Phase.REACH}), contact_found, Phase.CONTACT, "contact found"),

@@ -2,12 +2,13 @@
 
 import math
 
-from arm_companion.mission import actions
+from arm_companion.mission import actions, hazards
 from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction
 
+_OVERLOAD = 0x20  # hardware-error bit of a servo
 _BEHAVIOUR = {
     Phase.STARTUP: "startup",
     Phase.STOWED: "stowed",
@@ -49,7 +50,8 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.VEHICLE_STATE_FRESH: s.vehicle_fresh,
         ArmFlag.EXTERNAL_CONTROL: s.external,
         ArmFlag.SETPOINTS_SENT: actions.setpoint(s) is not None,
-        ArmFlag.FEEDFORWARD: state.phase is Phase.PERCHED and state.offset != ZERO,
+        ArmFlag.FEEDFORWARD: state.lean != ZERO
+        or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
         ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
         ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
         ArmFlag.ANCHORED: state.phase is Phase.PERCHED,
@@ -65,6 +67,14 @@ def _present_faults(s: Situation) -> ArmFault:
         ArmFault.VEHICLE_STATE_STALE: not s.vehicle_fresh,
         ArmFault.AUTOPILOT_FAILSAFE: vehicle.control is Control.FAILSAFE,
         ArmFault.SERVO_SILENT: any(tendon.silent for tendon in tendons),
+        ArmFault.ESTIMATOR_JUMP: hazards.estimator_jumped(s) is not None,
+        ArmFault.SETPOINT_REJECTED: hazards.astray(s) is not None,
+        ArmFault.GROUND_LOST: hazards.ground_lost(s) is not None,
+        ArmFault.OVERHEAT: hazards.hot(s) is not None,
+        ArmFault.OVERLOAD: any(tendon.error_bits & _OVERLOAD for tendon in tendons),
+        ArmFault.LOW_VOLTAGE: hazards.low_voltage(s) is not None,
+        ArmFault.MODEL: hazards.model_blind(s) is not None,
+        ArmFault.CYCLE_OVERRUN: hazards.overrun(s) is not None,
         ArmFault.SERVO_FAULT: any(tendon.error_bits or not tendon.homed for tendon in tendons),
         ArmFault.TENDON_SLACK: any(
             t.torque and t.tension + 2.0 * t.tension_sigma < s.config.limits.tension_min_n for t in tendons

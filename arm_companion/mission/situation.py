@@ -13,7 +13,7 @@ from arm_companion.config.schema import Config
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Vec3
-from arm_companion.mission.motion import dot, norm, scale, sub, turn_by_yaw, unrotate
+from arm_companion.mission.motion import ZERO, add, dot, norm, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, State
 
 _FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
@@ -148,13 +148,17 @@ class Situation:
 
     @property
     def bar(self) -> Bar:
-        """The target: the newest one received, else the configuration's."""
-        if self.facts.bar is not None:
-            return self.facts.bar
-        perch = self.config.perch
-        heading = math.radians(perch.bar_axis_deg)
-        x, y, z = perch.bar_position_m
-        return Bar((x, y, z), (math.cos(heading), math.sin(heading), 0.0), perch.bar_radius_m)
+        """The target: the newest one received, else the configuration's, where the estimator now says it is."""
+        bar = self.facts.bar
+        if bar is None:
+            perch = self.config.perch
+            heading = math.radians(perch.bar_axis_deg)
+            x, y, z = perch.bar_position_m
+            bar = Bar((x, y, z), (math.cos(heading), math.sin(heading), 0.0), perch.bar_radius_m)
+        vigil = self.state.vigil
+        if vigil.shift == ZERO or self.t - self.facts.bar_age_s > vigil.jumped_at:  # nothing jumped since it was told
+            return bar
+        return dataclasses.replace(bar, point_w=add(bar.point_w, vigil.shift))
 
     def base_offset_w(self, yaw: float) -> Vec3:
         """From the vehicle's centre of mass to the arm's base while it hovers at `yaw`, world axes."""

@@ -94,6 +94,39 @@ class Prediction:
     stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
+FOLLOWS = frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
+"""Phases in which nothing but air is between the vehicle and its reference."""
+
+
+@dataclass(frozen=True, slots=True)
+class Vigil:
+    """For how long each doubtful fact has held, s, and where the vehicle was in the cycle before.
+
+    Attributes:
+        position_w: of the vehicle, m; None: it was not fresh.
+        velocity_w: of the vehicle, m/s.
+        astray_s: a free vehicle is far from its reference.
+        hot_s: a servo is close to its temperature limit.
+        low_s: the supply is close to its lower limit.
+        slack_s: a tendon is surely under its least tension.
+        blind_s: the mechanics have no solution.
+        shift: sum of the jumps of the estimator, m.
+        jumped_at: loop time of the last jump.
+        leap_m: its size.
+    """
+
+    position_w: Vec3 | None = None
+    velocity_w: Vec3 = ZERO
+    astray_s: float = 0.0
+    hot_s: float = 0.0
+    low_s: float = 0.0
+    slack_s: float = 0.0
+    blind_s: float = 0.0
+    shift: Vec3 = ZERO
+    jumped_at: float = 0.0
+    leap_m: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class State:
     """Memory of the mission: plain values, so that a record holds all of it."""
@@ -103,6 +136,7 @@ class State:
     t: float = 0.0  # loop time of the previous step
     running: Running | None = None
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
+    armed: bool = False  # of the previous step, to see the motors stop
     streaming: bool = False  # set-points go out
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
@@ -114,6 +148,8 @@ class State:
     force: ForceObserver = ForceObserver()
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
     watch: tuple[TendonWatch, ...] = ()  # of each tendon
+    vigil: Vigil = Vigil()
+    feedforward: bool = True  # switched on
     position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None
     rest: Vec3 | None = None  # m, where the anchored vehicle stays by itself; moves are counted from here

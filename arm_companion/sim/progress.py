@@ -8,6 +8,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.table import Table
 
+from arm_companion.sim.trials import Outcome, Summary
 from arm_companion.sim.verdict import Verdict
 
 
@@ -66,6 +67,30 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
     for path in files:
         if path.exists():
             console.print(f"  {path}", soft_wrap=True)
+
+
+def show_outcome(outcome: Outcome, stream: TextIO) -> None:
+    """A line for one trial."""
+    what = "perched" if outcome.success else f"failed: {outcome.reason}"
+    print(f"seed {outcome.seed}: {what} ({outcome.words})", file=stream, flush=True)
+
+
+def show_summary(summary: Summary, stream: TextIO) -> None:
+    """How many of the trials succeeded, with the interval that the true share lies in, and why the others did not."""
+    trials = len(summary.outcomes)
+    low, high = summary.interval
+    table = Table(title=f"Anchor perch, {trials} trials", title_justify="left", show_header=True, header_style="bold")
+    table.add_column("what")
+    table.add_column("trials", justify="right")
+    table.add_column("share", justify="right")
+    table.add_column("95 % interval (Wilson)", justify="right")
+    share = f"{summary.success / trials:.0%}"
+    table.add_row("perched and let go", str(summary.success), share, f"{low:.0%} to {high:.0%}")
+    table.add_row("harm: limit, airframe or fall", str(summary.harmed), f"{summary.harmed / trials:.0%}", "")
+    table.add_section()
+    for reason, count in summary.failures.items():
+        table.add_row(reason.replace("[", "("), str(count), f"{count / trials:.0%}", "")
+    Console(file=stream, highlight=False).print(table)
 
 
 def _mm(metres: float) -> str:

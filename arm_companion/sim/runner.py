@@ -47,11 +47,20 @@ class DaemonDied(ArmError):
     """The daemon's process ended while it was needed."""
 
 
-async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: None) -> Result:
-    """One perch on the running simulated loop: every part in this process, over in-memory pipes."""
+async def fly_simulated(
+    config: Config, say: Say, prepare: Prepare = lambda _: None, *, world: Config | None = None
+) -> Result:
+    """One perch on the running simulated loop: every part in this process, over in-memory pipes.
+
+    Args:
+        config: the daemon's.
+        say: told what happens.
+        prepare: changes the world before the flight.
+        world: how the world is, where it differs from what the daemon believes.
+    """
     companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
-    world = World(config)
-    prepare(world)
+    plant = World(config if world is None else world)
+    prepare(plant)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
     recorder = MemoryRecorder()
     openers = Openers(
@@ -62,13 +71,13 @@ async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: N
         servos.opener(1),
     )
     daemon = Daemon(config, openers, clock, ServiceManager(""), recorder, model=_model(config))
-    bus = EmulatedBus(world.servos, config.servos)
-    flight = Flight(samples=world.samples)
+    bus = EmulatedBus(plant.servos, config.servos)
+    flight = Flight(samples=plant.samples)
     link = OperatorLink([ground.opener(1), arm.opener(1)])
     stop = asyncio.Event()
     async with _running(
-        world.run,
-        lambda: world.autopilot.run(companion.opener(0), ground.opener(0)),
+        plant.run,
+        lambda: plant.autopilot.run(companion.opener(0), ground.opener(0)),
         lambda: bus.serve_memory(servos.opener(0)),
         lambda: daemon.run(stop),
         link.run,

@@ -11,6 +11,7 @@ from arm_companion.mission.facts import (
     Answer,
     ArmAction,
     ArmFault,
+    ArmFlag,
     Commands,
     Control,
     Facts,
@@ -351,3 +352,46 @@ def test_a_prediction_starts_from_the_last_and_says_what_a_first_one_would(
     assert warm.prediction.free.iterations < alone.prediction.free.iterations
     assert warm.prediction.tip_a == pytest.approx(alone.prediction.tip_a, abs=1e-7)
     assert warm.prediction.wrench.force_b == pytest.approx(alone.prediction.wrench.force_b, abs=1e-6)
+
+
+# FEEDFORWARD.
+
+
+def leaning(parameters: Parameters, hovering: Hovering) -> tuple[State, Facts]:
+    """A perched mission that is asked for 10 mm, three seconds ago."""
+    bend = (4.9, 0.0)
+    facts = hovering(bend)
+    held = at(Phase.PERCHED, bend=bend, bend_goal=bend, position=(2.0, 0.0, -2.2), tension=(25.0, 9.0, 0.5, 9.0))
+    anchor = grip(Situation(held, facts, 100.0, parameters))
+    state, _ = run(
+        dataclasses.replace(held, anchor=anchor), ask(facts, Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 3.0
+    )
+    return state, facts
+
+
+def test_the_feedforward_goes_off_and_on_by_command_without_a_step(parameters: Parameters, hovering: Hovering) -> None:
+    state, facts = leaning(parameters, hovering)
+    assert state.lean != (0.0, 0.0, 0.0)
+    full = math.hypot(*state.lean)
+    for wanted, end in ((0.0, 0.0), (1.0, full)):
+        before = state.lean
+        state, said = run(state, ask(facts, Order.FEEDFORWARD, wanted), parameters, 4.0)
+        assert [a.result for a in answers(said)] == [Result.ACCEPTED]
+        leans = [before, *(c.setpoint.acceleration_w for c in said if c.setpoint is not None)]
+        assert all(math.dist(a, b) <= 1.0 * DT + 1e-9 for a, b in pairwise(leans))
+        assert math.hypot(*state.lean) == pytest.approx(end, abs=0.05)
+        assert bool(said[-1].status.flags & ArmFlag.FEEDFORWARD) == bool(wanted)
+        assert state.phase is Phase.PERCHED
+
+
+@pytest.mark.parametrize("phase", list(Phase))
+def test_feedforward_may_be_switched_anywhere_and_ends_no_other_order(
+    parameters: Parameters, hovering: Hovering, phase: Phase
+) -> None:
+    running = Running(3, Order.PERCH, frozenset())
+    state, (commands,) = run(
+        at(phase, anchor=ANCHOR, running=running), ask(hovering(), Order.FEEDFORWARD, 0.0), parameters
+    )
+    assert not state.feedforward
+    assert (7, Result.ACCEPTED) in [(a.request, a.result) for a in commands.answers]
+    assert (3, Result.CANCELLED) not in [(a.request, a.result) for a in commands.answers]

@@ -1,0 +1,159 @@
+"""What can go wrong: guards that give their reason in words. The perch's table says what follows in which phase.
+
+What lasts before it counts has its timer in `vigil`.
+"""
+
+import math
+
+from arm_companion.mission.facts import Control
+from arm_companion.mission.motion import norm, sub
+from arm_companion.mission.situation import Situation
+
+_SLIP_M = 0.12
+_ASTRAY_S = 1.0
+_DOUBTFUL_S = 1.0
+_BLIND_S = 0.5
+_GROUND_LOST_S = 5.0
+_OVERRUN_S = 0.1  # the longest step that a cycle believes
+
+
+# --- the vehicle ---
+
+
+def pilot_takes_over(s: Situation) -> str | None:
+    """The autopilot left our mode: whoever did it, the vehicle is theirs."""
+    if s.external or s.facts.vehicle.control is Control.FAILSAFE:
+        return None
+    return f"the pilot has the vehicle (mode {s.facts.vehicle.mode})"
+
+
+def failsafe(s: Situation) -> str | None:
+    """The autopilot is in an emergency and flies by itself."""
+    return f"autopilot failsafe (mode {s.facts.vehicle.mode})" if s.facts.vehicle.control is Control.FAILSAFE else None
+
+
+def disarmed(s: Situation) -> str | None:
+    """The motors stand. Of an autopilot that has not been heard yet, nobody knows."""
+    vehicle = s.facts.vehicle
+    return "the vehicle is disarmed" if not vehicle.armed and vehicle.heartbeat_age_s < math.inf else None
+
+
+def motors_stopped(s: Situation) -> str | None:
+    """The motors stopped in this cycle; a vehicle that stood before is let go when a person says so."""
+    return disarmed(s) if s.state.armed else None
+
+
+def vehicle_lost(s: Situation) -> str | None:
+    """State or heartbeat of the vehicle is too old."""
+    v = s.facts.vehicle
+    if s.vehicle_fresh:
+        return None
+    age = max(v.position_age_s, v.attitude_age_s)
+    return f"vehicle state is {age:.2f} s old, heartbeat {v.heartbeat_age_s:.1f} s"
+
+
+# --- the arm ---
+
+
+def servo_fault(s: Situation) -> str | None:
+    """A servo is silent, reports a hardware error, or no longer knows its turns."""
+    return s.servo_fault
+
+
+def tendon_broken(s: Situation) -> str | None:
+    """A tendon carries nothing where the statics say that it must."""
+    return next((watched.broken for watched in s.state.watch if watched.broken), None)
+
+
+def tendon_jumped(s: Situation) -> str | None:
+    """A tendon's tension does not fit its displacement."""
+    return next((watched.jumped for watched in s.state.watch if watched.jumped), None)
+
+
+def grip_lost(s: Situation) -> str | None:
+    """The vehicle is far from where the grip would have kept it."""
+    return f"grip lost: vehicle moved {s.slipped:.2f} m" if s.slipped > _SLIP_M else None
+
+
+def overstressed(s: Situation) -> str | None:
+    """A tendon carries more than its limit."""
+    most, limit = max(s.tensions), s.config.limits.tension_max_n
+    return f"tendon tension {most:.1f} N is over {limit:g} N" if most > limit else None
+
+
+def wrench_over_limit(s: Situation) -> str | None:
+    """The arm is predicted to push or twist the airframe harder than it may."""
+    prediction, limits = s.state.prediction, s.config.limits
+    if prediction is None or not prediction.wrench.valid:
+        return None
+    force, torque = norm(prediction.wrench.force_b), norm(prediction.wrench.torque_b)
+    if force > limits.wrench_force_n:
+        return f"{force:.1f} N on the airframe is over {limits.wrench_force_n:g} N"
+    if torque > limits.wrench_moment_nm:
+        return f"{torque:.2f} N m on the airframe is over {limits.wrench_moment_nm:g} N m"
+    return None
+
+
+# --- the vehicle's path ---
+
+
+def estimator_jumped(s: Situation) -> str | None:
+    """The autopilot's position jumped in this cycle: where the bar is, nobody knows until it is told again."""
+    vigil = s.state.vigil
+    return f"the vehicle's position jumped by {vigil.leap_m:.2f} m" if vigil.jumped_at == s.t > 0.0 else None
+
+
+def astray(s: Situation) -> str | None:
+    """The vehicle does not follow the set-points, though it says that it takes them."""
+    reference = s.state.reference
+    if s.state.vigil.astray_s <= _ASTRAY_S or reference is None:
+        return None
+    away = norm(sub(reference.position, s.facts.vehicle.position_w))
+    return f"the vehicle does not follow: {away:.1f} m from its set-point"
+
+
+# --- what comes before a servo's own fault ---
+
+
+def hot(s: Situation) -> str | None:
+    """A servo is close to the temperature at which it lets go."""
+    if s.state.vigil.hot_s <= _DOUBTFUL_S:
+        return None
+    i, most = max(enumerate(t.temperature for t in s.facts.tendons), key=lambda pair: pair[1])
+    return f"tendon {i + 1}: servo at {most:.0f} degC lets go at {s.config.servos.temperature_limit_c}"
+
+
+def low_voltage(s: Situation) -> str | None:
+    """The servos' supply is close to its limit."""
+    if s.state.vigil.low_s <= _DOUBTFUL_S:
+        return None
+    least = min(t.voltage for t in s.facts.tendons)
+    return f"servo supply {least:.1f} V, least {s.config.servos.voltage_min_v:g} V"
+
+
+# --- what is told and changes nothing ---
+
+
+def slack(s: Situation) -> str | None:
+    """A tendon is surely under its least tension."""
+    if s.state.vigil.slack_s <= _DOUBTFUL_S:
+        return None
+    i, least = min(enumerate(s.tensions), key=lambda pair: pair[1])
+    return f"tendon {i + 1} slack: {least:.1f} N"
+
+
+def model_blind(s: Situation) -> str | None:
+    """The mechanics have no solution: nothing is fed forward, and the wrench is not valid."""
+    return "the arm's mechanics have no solution" if s.state.vigil.blind_s > _BLIND_S else None
+
+
+def ground_lost(s: Situation) -> str | None:
+    """No ground station that may command has been heard for a while, though one was."""
+    age = s.facts.ground_age_s
+    return f"ground station silent for {_GROUND_LOST_S:g} s" if _GROUND_LOST_S < age < math.inf else None
+
+
+def overrun(s: Situation) -> str | None:
+    """This cycle came so late that it moves nothing farther than a tenth of a second allows."""
+    late = s.t - s.state.t if s.state.t else 0.0
+    return "the control cycle is late" if late > _OVERRUN_S else None

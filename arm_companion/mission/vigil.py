@@ -1,0 +1,96 @@
+"""What has to last before it counts: how long each doubtful fact has held, and jumps of the vehicle's position."""
+
+import math
+from dataclasses import replace
+
+from arm_companion.mission.facts import Vec3
+from arm_companion.mission.motion import add, norm, scale, sub
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import FOLLOWS, State
+
+HEAT_MARGIN_K = 7.0
+"""A servo is called hot by so much before it lets go."""
+
+VOLTAGE_MARGIN_V = 0.5
+"""The supply is called low by so much before a servo reports it."""
+
+_JUMP_M = 0.25  # more than the estimator's noise, less than what hurts at a bar
+_ASTRAY_M = 0.5  # the reference moves at half a metre a second, and a multirotor lags it by less than a second
+
+
+def keep_vigil(s: Situation) -> State:
+    """Memory with the timers of this cycle; after a jump of the position, everything known moves with it."""
+    if (leap := _leap(s)) is not None:
+        s = s.remembering(_move_frame(s, leap))
+    state, dt = s.state, s.dt
+    limits, servos, tendons = s.config.limits, s.config.servos, s.facts.tendons
+    heard = [tendon for tendon in tendons if not tendon.silent and math.isfinite(tendon.tension_sigma)]
+
+    def time(before: float, *, holds: bool) -> float:
+        return before + dt if holds else 0.0
+
+    before = state.vigil
+    vigil = replace(
+        before,
+        position_w=s.facts.vehicle.position_w if s.vehicle_fresh else None,
+        velocity_w=s.facts.vehicle.velocity_w,
+        astray_s=time(before.astray_s, holds=_astray(s)),
+        hot_s=time(before.hot_s, holds=any(t.temperature > servos.temperature_limit_c - HEAT_MARGIN_K for t in heard)),
+        low_s=time(before.low_s, holds=any(t.voltage < servos.voltage_min_v + VOLTAGE_MARGIN_V for t in heard)),
+        slack_s=time(
+            before.slack_s,
+            holds=any(t.torque and t.tension + 2.0 * t.tension_sigma < limits.tension_min_n for t in heard),
+        ),
+        blind_s=time(before.blind_s, holds=_blind(s)),
+    )
+    return replace(state, vigil=vigil)
+
+
+def _astray(s: Situation) -> bool:
+    """Whether a vehicle that should follow the reference is far from it."""
+    reference = s.state.reference
+    if s.state.phase not in FOLLOWS or reference is None or not (s.external and s.vehicle_fresh):
+        return False
+    return norm(sub(reference.position, s.facts.vehicle.position_w)) > _ASTRAY_M
+
+
+def _blind(s: Situation) -> bool:
+    """Whether the mechanics found no equilibrium for what the arm is doing now."""
+    prediction = s.state.prediction
+    return prediction is not None and s.vehicle_fresh and math.isnan(prediction.wrench.residual)
+
+
+def _leap(s: Situation) -> Vec3 | None:
+    """By how much the estimator moved the vehicle since the last cycle, m; None when the vehicle may have flown it.
+
+    Between two positions lie at most the way that the greater of both speeds makes, and the estimator's noise.
+    """
+    last, vehicle = s.state.vigil, s.facts.vehicle
+    if last.position_w is None or not s.vehicle_fresh:
+        return None
+    way = sub(vehicle.position_w, last.position_w)
+    speed = max(norm(vehicle.velocity_w), norm(last.velocity_w))
+    elapsed = s.t - s.state.t + s.config.vehicle.state_timeout_s
+    if norm(way) <= _JUMP_M + speed * elapsed:
+        return None
+    return sub(way, scale(vehicle.velocity_w, s.dt))
+
+
+def _move_frame(s: Situation, leap: Vec3) -> State:
+    """Everything that is remembered in world axes moves with the estimate: the vehicle itself has not moved.
+
+    Without this an anchored vehicle would seem to have slipped, and a free one would be sent back by the jump.
+    """
+    state = s.state
+    anchor, reference = state.anchor, state.reference
+    told_since = s.t - s.facts.bar_age_s > state.vigil.jumped_at  # the bar, in the frame after the last jump
+    shift = leap if told_since else add(state.vigil.shift, leap)
+    return replace(
+        state,
+        reference=None if reference is None else replace(reference, position=add(reference.position, leap)),
+        contact_w=add(state.contact_w, leap),
+        position=add(state.position, leap),
+        anchor=None if anchor is None else replace(anchor, position_w=add(anchor.position_w, leap)),
+        rest=None if state.rest is None else add(state.rest, leap),
+        vigil=replace(state.vigil, shift=shift, jumped_at=s.t, leap_m=norm(leap)),
+    )

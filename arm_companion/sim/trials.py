@@ -1,0 +1,233 @@
+"""Many perches in worlds that differ from what the controller believes: how often it works, and why it does not.
+
+A trial is drawn from its seed alone, so that a failure is flown again with `--trials 1 --seed N`.
+"""
+
+import collections
+import dataclasses
+import math
+import multiprocessing
+import random
+import re
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from statistics import NormalDist
+
+from arm_companion.clock import run_simulated
+from arm_companion.config import Config, load
+from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.verdict import judge
+
+MODEL_ERROR = 0.1
+"""Greatest relative difference between the plant and the controller's parameters."""
+
+_BAR_MOVED_M = (0.5, 0.5, 0.2)  # where the bar is: told to the daemon
+_BAR_TURNED_DEG = 20.0
+_BAR_ERROR_M = 0.01  # by how much what it is told is wrong, each axis
+_BAR_ERROR_DEG = 2.0
+_WIND_M_PER_S = 2.0
+_CONFIDENCE = 0.95
+_OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One trial's differences.
+
+    Attributes:
+        controller: what the daemon is given.
+        world: how the plant is.
+        words: the differences for people.
+    """
+
+    controller: Config
+    world: Config
+    words: str
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one trial."""
+
+    seed: int
+    success: bool
+    reason: str
+    harm: str  # a limit broken, the airframe touched or the vehicle fell; empty: none
+    words: str
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What became of all."""
+
+    outcomes: tuple[Outcome, ...]
+
+    @property
+    def success(self) -> int:
+        """How many succeeded."""
+        return sum(outcome.success for outcome in self.outcomes)
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Wilson's interval of the share of successes."""
+        return wilson(self.success, len(self.outcomes))
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """How often each reason ended a trial, the most frequent first; figures in reasons are left out."""
+        return dict(collections.Counter(kind(o.reason) for o in self.outcomes if not o.success).most_common())
+
+    @property
+    def harmed(self) -> int:
+        """How many trials broke a limit, touched with the airframe or fell."""
+        return sum(bool(outcome.harm) for outcome in self.outcomes)
+
+
+def wilson(successes: int, trials: int, confidence: float = _CONFIDENCE) -> tuple[float, float]:
+    """Wilson's score interval of a share (E. B. Wilson, J. Am. Stat. Assoc. 22, 1927).
+
+    Args:
+        successes: how many.
+        trials: of how many.
+        confidence: that the true share lies inside.
+
+    Raises:
+        ValueError: more successes than trials, or negative ones.
+    """
+    if not 0 <= successes <= trials:
+        raise ValueError(f"{successes} successes of {trials} trials")
+    if trials == 0:
+        return 0.0, 1.0
+    z = NormalDist().inv_cdf(0.5 + confidence / 2.0)
+    share = successes / trials
+    scale = 1.0 + z**2 / trials
+    middle = (share + z**2 / (2.0 * trials)) / scale
+    half = z / scale * math.sqrt(share * (1.0 - share) / trials + z**2 / (4.0 * trials**2))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def kind(reason: str) -> str:
+    """A reason without its figures, so that two of a kind count as one."""
+    return re.sub(r"-?\d+(\.\d+)?", "…", reason)
+
+
+def draw(config: Config, seed: int) -> Draw:
+    """The worlds of one trial.
+
+    The controller keeps its own parameters of arm and vehicle; it is told where the bar is, with an error.
+    """
+    rng = random.Random(seed)  # noqa: S311 - repeatable by design
+
+    def within(most: float) -> float:
+        return rng.uniform(-most, most)
+
+    def off() -> float:
+        return 1.0 + within(MODEL_ERROR)
+
+    replace = dataclasses.replace
+    bar, perch, arm = config.sim.bar, config.perch, config.arm
+    moved, turned = [within(most) for most in _BAR_MOVED_M], within(_BAR_TURNED_DEG)
+    told = [within(_BAR_ERROR_M) for _ in range(3)]
+    speed, heading = _WIND_M_PER_S * math.sqrt(rng.random()), within(math.pi)
+    wind = (speed * math.cos(heading), speed * math.sin(heading), 0.0)
+    share = {name: off() for name in ("EI", "k_T", "friction", "arm mass", "vehicle mass")}
+    sim = replace(
+        config.sim,
+        seed=seed,
+        wind_m_per_s=tuple(a + b for a, b in zip(config.sim.wind_m_per_s, wind, strict=True)),
+        bar=replace(
+            bar,
+            position_m=tuple(a + b for a, b in zip(bar.position_m, moved, strict=True)),
+            axis_deg=bar.axis_deg + turned,
+            friction=bar.friction * share["friction"],
+        ),
+    )
+    controller = replace(
+        config,
+        sim=sim,
+        perch=replace(
+            perch,
+            bar_position_m=tuple(a + b + e for a, b, e in zip(perch.bar_position_m, moved, told, strict=True)),
+            bar_axis_deg=perch.bar_axis_deg + turned + within(_BAR_ERROR_DEG),
+        ),
+    )
+    backbone, tendons, mass = arm.backbone, arm.tendons, arm.mass
+    world = replace(
+        controller,
+        vehicle=replace(config.vehicle, mass_kg=config.vehicle.mass_kg * share["vehicle mass"]),
+        arm=replace(
+            arm,
+            backbone=replace(backbone, youngs_modulus_pa=backbone.youngs_modulus_pa * share["EI"]),
+            tendons=replace(
+                tendons,
+                youngs_modulus_pa=tendons.youngs_modulus_pa * share["k_T"],
+                servo_stiffness_n_per_m=tendons.servo_stiffness_n_per_m * share["k_T"],
+            ),
+            mass=replace(
+                mass,
+                disk_kg=mass.disk_kg * share["arm mass"],
+                end_disk_kg=mass.end_disk_kg * share["arm mass"],
+                backbone_density_kg_m3=mass.backbone_density_kg_m3 * share["arm mass"],
+            ),
+        ),
+    )
+    words = ", ".join(f"{name} {100 * (value - 1):+.0f} %" for name, value in share.items())
+    error = "/".join(f"{1e3 * e:+.0f}" for e in told)
+    return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, bar told {error} mm off")
+
+
+def fly_one(file: str, settings: tuple[str, ...], seed: int) -> Outcome:
+    """One trial in simulated time, in this process.
+
+    Args:
+        file: configuration, read anew because a read one does not travel between processes.
+        settings: options that override it.
+        seed: of the trial.
+
+    Raises:
+        ConfigError: the configuration cannot be used.
+    """
+    config = load(file, settings)
+    drawn = draw(config, seed)
+    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world))
+    verdict = judge(result.flight, result.failure)
+    samples = result.flight.samples
+    most = max((max(sample.truth.tension) for sample in samples), default=0.0)
+    harm = [reason for reason in verdict.reason.split("; ") if "airframe touched" in reason or "did not land" in reason]
+    if most > _OVER * config.limits.tension_max_n:
+        harm.append(f"a tendon carried {most:.1f} N")
+    return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words)
+
+
+def fly(
+    file: str,
+    settings: Sequence[str],
+    seeds: Sequence[int],
+    jobs: int,
+    told: Callable[[Outcome], None] = lambda _: None,
+) -> Summary:
+    """All trials, each in a process of `jobs`.
+
+    Args:
+        file: configuration of every trial, before it is drawn.
+        settings: options that override it.
+        seeds: one for each trial.
+        jobs: processes that fly at the same time.
+        told: called with each outcome as it comes, in any order.
+
+    Raises:
+        BrokenProcessPool: a process died.
+    """
+    spawn = multiprocessing.get_context("spawn")
+    outcomes: list[Outcome] = []
+    with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
+        waiting = [pool.submit(fly_one, file, tuple(settings), seed) for seed in seeds]
+        try:
+            for done in as_completed(waiting):
+                outcomes.append(done.result())
+                told(outcomes[-1])
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return Summary(tuple(sorted(outcomes, key=lambda outcome: outcome.seed)))

@@ -1,0 +1,142 @@
+"""Drawn worlds: what differs, that it is repeatable, how outcomes are counted, and one short run through processes."""
+
+import json
+import math
+from concurrent.futures import Future
+from statistics import NormalDist
+from typing import Any, Self
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arm_companion.__main__ import main
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.config import load
+from arm_companion.sim import trials
+from arm_companion.sim.trials import MODEL_ERROR, Outcome, Summary, draw, kind, wilson
+from arm_companion.sim.world import World
+
+CONFIG = load("sim.toml")
+
+
+@given(st.integers(0, 10_000))
+def test_the_plant_differs_within_the_model_error_and_the_controller_does_not_know(seed: int) -> None:
+    drawn = draw(CONFIG, seed)
+    assert drawn.controller.arm == CONFIG.arm
+    assert drawn.controller.vehicle == CONFIG.vehicle
+    ours, theirs = ArmParameters.of(drawn.controller.arm), ArmParameters.of(drawn.world.arm)
+    pairs = [
+        (ours.EI, theirs.EI),
+        (CONFIG.vehicle.mass_kg, drawn.world.vehicle.mass_kg),
+        (CONFIG.sim.bar.friction, drawn.world.sim.bar.friction),
+        (CONFIG.arm.mass.disk_kg, drawn.world.arm.mass.disk_kg),
+        *zip(ours.k_T.tolist(), theirs.k_T.tolist(), strict=True),
+    ]
+    for own, other in pairs:
+        assert abs(other / own - 1.0) <= MODEL_ERROR + 1e-9
+    told, there = drawn.controller.perch.bar_position_m, drawn.world.sim.bar.position_m
+    assert max(abs(a - b) for a, b in zip(told, there, strict=True)) <= 0.010 + 1e-9
+    assert math.hypot(*drawn.world.sim.wind_m_per_s) <= 2.0
+    assert drawn == draw(CONFIG, seed)
+
+
+def test_seeds_differ_and_the_plant_takes_its_own_values() -> None:
+    one, other = draw(CONFIG, 1), draw(CONFIG, 2)
+    assert one.world != other.world
+    nominal, drawn = World(CONFIG).plant, World(one.world).plant
+    share = one.world.arm.backbone.youngs_modulus_pa / CONFIG.arm.backbone.youngs_modulus_pa
+    bending = [joint for joint in range(nominal._model.njnt) if nominal._model.jnt_stiffness[joint] > 0.0]
+    assert bending
+    for joint in bending:
+        assert drawn._model.jnt_stiffness[joint] == pytest.approx(share * nominal._model.jnt_stiffness[joint], rel=1e-3)
+    assert drawn._model.body_mass.sum() / nominal._model.body_mass.sum() == pytest.approx(
+        one.world.vehicle.mass_kg / CONFIG.vehicle.mass_kg, rel=1e-3
+    )
+
+
+@given(st.integers(0, 200), st.integers(1, 200))
+def test_wilsons_interval_solves_its_own_equation(successes: int, trials_: int) -> None:
+    """Its ends are the shares p with |k/n - p| = z sqrt(p (1 - p) / n)."""
+    successes = min(successes, trials_)
+    z = NormalDist().inv_cdf(0.975)
+    low, high = wilson(successes, trials_)
+    share = successes / trials_
+    assert 0.0 <= low <= share + 1e-12
+    assert share - 1e-12 <= high <= 1.0
+    for end in (low, high):
+        assert abs(share - end) == pytest.approx(z * math.sqrt(end * (1.0 - end) / trials_), abs=1e-6)
+
+
+def test_wilsons_interval_of_95_in_100_is_the_textbooks() -> None:
+    assert wilson(95, 100) == pytest.approx((0.8882, 0.9785), abs=1e-4)
+    assert wilson(0, 0) == (0.0, 1.0)
+    with pytest.raises(ValueError, match="3 successes of 2"):
+        wilson(3, 2)
+
+
+def test_reasons_that_differ_in_figures_alone_are_counted_together() -> None:
+    summary = Summary(
+        (
+            Outcome(1, True, "", "", ""),
+            Outcome(2, False, "grip lost: vehicle moved 0.13 m", "", ""),
+            Outcome(3, False, "grip lost: vehicle moved 0.21 m", "the vehicle did not land", ""),
+            Outcome(4, False, "never perched", "", ""),
+        )
+    )
+    assert summary.failures == {kind("grip lost: vehicle moved 0.13 m"): 2, "never perched": 1}
+    assert (summary.success, summary.harmed) == (1, 1)
+
+
+class Pool:
+    """Processes that fly nothing: outcomes by seed."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        pass
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def submit(self, _: Any, __: str, ___: tuple[str, ...], seed: int) -> "Future[Outcome]":
+        future: Future[Outcome] = Future()
+        good = seed != 8
+        future.set_result(Outcome(seed, good, "" if good else "no contact 6 cm past it", "", "drawn"))
+        return future
+
+
+@pytest.mark.parametrize(("seed", "code"), [(1, 0), (7, 1)])
+def test_the_command_line_prints_the_contract_and_says_by_its_exit_code_whether_all_succeeded(
+    seed: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(trials, "ProcessPoolExecutor", Pool)
+    words = ["sim", "perch", "--simulated", "--trials", "4", "--jobs", "2", "--seed", str(seed), "--json"]
+    assert main(words) == code
+    out, err = capsys.readouterr()
+    last = json.loads(out.splitlines()[-1])
+    assert (last["success"], last["trials"]) == (4 - code, 4)
+    assert sum(last["failures"].values()) == code
+    assert last["interval_95"][0] < last["success"] / 4 <= last["interval_95"][1]
+    assert "Wilson" in err
+
+
+@pytest.mark.parametrize("words", [["sim", "perch", "--trials", "3"], ["sim", "world", "--simulated", "--trials", "3"]])
+def test_trials_without_simulated_time_are_refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    assert "--simulated" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", ["0", "-2", "many"])
+def test_a_number_of_trials_that_is_none_is_refused(number: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(["sim", "perch", "--simulated", "--trials", number])
+    assert refused.value.code == 2
+    assert "--trials" in capsys.readouterr().err
+
+
+def test_what_a_process_raises_is_seen_here() -> None:
+    """Two processes that fail at once: what they raise is seen here, and no process is left behind."""
+    with pytest.raises(Exception, match="no_such_key"):
+        trials.fly("sim.toml", ["sim.no_such_key=1"], range(2), 2)

@@ -1,0 +1,146 @@
+"""The mission in simulated time without devices: memory in any phase, facts that change, and laws that always hold."""
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request
+from arm_companion.mission.mission import step
+from arm_companion.mission.motion import Reference, norm, sub
+from arm_companion.mission.situation import Parameters
+from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Phase, State
+
+DT = 0.01
+T0 = 100.0
+PLACE = (2.0, 0.0, -2.2)
+ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
+BENT = (3.0, 0.0)
+HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING})
+"""Phases in which the arm is around the bar."""
+
+Change = Callable[[Facts], Facts]
+
+
+def memory(phase: Phase, **fields: object) -> State:
+    """Memory of a mission that has just come into `phase`, the vehicle at PLACE under set-points."""
+    held = phase in HELD
+    bend = BENT if held else (0.0, 0.0)
+    known: dict[str, object] = {
+        "t": T0,
+        "since": T0 - 0.1,
+        "control": Control.EXTERNAL,
+        "armed": True,
+        "streaming": phase is not Phase.STARTUP,
+        "reference": Reference(PLACE),
+        "position": PLACE,
+        "contact_w": PLACE,
+        "anchor": ANCHOR if held else None,
+        "tension": (8.0, 4.0, 1.0, 4.0),
+        "bend": bend,
+        "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
+    }
+    return State(phase=phase, **{**known, **fields})  # type: ignore[arg-type]
+
+
+@dataclass
+class Run:
+    """A mission that steps, and everything that it said."""
+
+    state: State
+    parameters: Parameters
+    said: list[Commands] = dataclasses.field(default_factory=list)
+    phases: list[Phase] = dataclasses.field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.silent = False  # the pilot took over, and nobody has ordered READY since
+        self.phases.append(self.state.phase)
+
+    def cycle(self, facts: Facts, dt: float = DT) -> Commands:
+        """One step, after which all laws hold."""
+        before = self.state
+        self.state, commands = step(before, facts, before.t + dt, self.parameters)
+        self.said.append(commands)
+        if self.state.phase is not self.phases[-1]:
+            self.phases.append(self.state.phase)
+        self._check(before, facts, commands)
+        return commands
+
+    def cycles(self, facts: Facts, seconds: float) -> None:
+        """The same facts for a while; requests come once."""
+        for _ in range(max(round(seconds / DT), 1)):
+            self.cycle(facts)
+            facts = dataclasses.replace(facts, requests=())
+
+    @property
+    def texts(self) -> list[str]:
+        """Every notice so far."""
+        return [notice.text for commands in self.said for notice in commands.notices]
+
+    def _check(self, before: State, facts: Facts, commands: Commands) -> None:
+        """No command is illegal, and limits hold on what leaves."""
+        config, state = self.parameters.config, self.state
+        limits, perch = config.limits, config.perch
+        if before.control is Control.EXTERNAL and facts.vehicle.control is not Control.EXTERNAL and before.streaming:
+            self.silent = True
+        if any(request.order is Order.READY for request in facts.requests) and state.streaming:
+            self.silent = False
+        setpoint = commands.setpoint
+        if self.silent or not facts.vehicle.armed:
+            assert setpoint is None, "the pilot has the vehicle"
+        if setpoint is not None:
+            values = (*setpoint.position_w, *setpoint.velocity_w, *setpoint.acceleration_w, setpoint.yaw)
+            assert all(map(math.isfinite, values))
+            assert norm(setpoint.acceleration_w) <= limits.feedforward_m_per_s2 + 1e-9
+            fastest = max(perch.approach_speed_m_per_s, 3.0 * perch.reach_speed_m_per_s, limits.vehicle_speed_m_per_s)
+            assert norm(setpoint.velocity_w) <= fastest + 1e-9
+            if state.phase not in MOVES_VEHICLE and facts.vehicle.control is Control.EXTERNAL:
+                assert setpoint.velocity_w == (0.0, 0.0, 0.0), "nobody asked the vehicle to move"
+        assert commands.arm is not ArmAction.LIMP, "a limp arm drops what it holds"
+        assert (commands.pulls is not None) == (commands.arm is ArmAction.DRIVE)
+        if state.phase in {Phase.STARTUP, Phase.STOWED, Phase.HOLDING}:
+            assert commands.arm is ArmAction.HOLD, "nothing moves until told"
+        if commands.pulls is not None:
+            assert all(math.isfinite(pull) and abs(pull) <= limits.pull_max_m for pull in commands.pulls)
+            assert math.hypot(*state.bend) <= limits.bend_max_rad + 1e-9 or math.hypot(*before.bend) >= math.hypot(
+                *state.bend
+            )
+        if state.phase is before.phase and state.pulls and before.pulls:
+            turned = math.hypot(state.bend[0] - before.bend[0], state.bend[1] - before.bend[1])
+            assert turned <= perch.bend_speed_rad_per_s * 0.1 + 1e-9
+        assert not commands.recover or state.phase in {Phase.STARTUP, Phase.STOWED}
+        answered = [answer.request for answer in commands.answers]
+        assert {request.id for request in facts.requests} <= set(answered), "every order is answered in its cycle"
+
+
+def ask(facts: Facts, order: Order, *values: float, request: int = 7) -> Facts:
+    """The same facts with one order."""
+    return dataclasses.replace(facts, requests=(Request(request, order, values),))
+
+
+def vehicle(**fields: object) -> Change:
+    """Facts in which the vehicle differs."""
+    return lambda facts: dataclasses.replace(facts, vehicle=dataclasses.replace(facts.vehicle, **fields))  # type: ignore[arg-type]
+
+
+def tendon(i: int, **fields: object) -> Change:
+    """Facts in which one tendon differs."""
+
+    def change(facts: Facts) -> Facts:
+        tendons = list(facts.tendons)
+        tendons[i] = dataclasses.replace(tendons[i], **fields)  # type: ignore[arg-type]
+        return dataclasses.replace(facts, tendons=tuple(tendons))
+
+    return change
+
+
+def changed(facts: Facts, changes: Iterable[Change]) -> Facts:
+    """All changes, one after the other."""
+    for change in changes:
+        facts = change(facts)
+    return facts
+
+
+def moved(by: tuple[float, float, float]) -> Change:
+    """Facts in which the vehicle is elsewhere."""
+    return lambda facts: vehicle(position_w=sub(facts.vehicle.position_w, (-by[0], -by[1], -by[2])))(facts)
