@@ -17,7 +17,8 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock
 from arm_companion.config.schema import Config
 from arm_companion.errors import ArmError
-from arm_companion.recorder import MemoryRecorder, Record
+from arm_companion.record import file_recorder
+from arm_companion.record.recorder import Both, MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
 from arm_companion.sim.scenario import Operator, Say
@@ -47,13 +48,21 @@ class DaemonDied(ArmError):
     """The daemon's process ended while it was needed."""
 
 
-async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: None) -> Result:
-    """One perch on the running simulated loop: every part in this process, over in-memory pipes."""
+async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: None, log: Path | None = None) -> Result:
+    """One perch on the running simulated loop: every part in this process, over in-memory pipes.
+
+    Args:
+        config: of world and daemon.
+        say: told what happens.
+        prepare: changes the world before the flight.
+        log: where the daemon's record goes.
+    """
     companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
     world = World(config)
     prepare(world)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
-    recorder = MemoryRecorder()
+    memory = MemoryRecorder()
+    recorder = memory if log is None else Both(memory, file_recorder(log, config, clock, patient=True))
     openers = Openers(
         {
             name: companion.opener(1) if link.role == "autopilot" else arm.opener(0)
@@ -76,7 +85,7 @@ async def fly_simulated(config: Config, say: Say, prepare: Prepare = lambda _: N
         failure = await Operator(link, config, flight, say).fly_perch()
         stop.set()
         await asyncio.sleep(0.5)
-    return Result(flight, failure, daemon.cycles, daemon.missed, recorder.records)
+    return Result(flight, failure, daemon.cycles, daemon.missed, memory.records)
 
 
 def _model(config: Config) -> RodModel:

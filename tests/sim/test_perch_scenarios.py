@@ -10,8 +10,8 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.mission.situation import Parameters
+from arm_companion.record.recorder import replay
 from arm_companion.record_codec import dumps
-from arm_companion.recorder import replay
 from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.verdict import Verdict, judge
 from arm_companion.sim.world import World
