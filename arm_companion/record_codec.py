@@ -8,6 +8,7 @@ import dataclasses
 import enum
 import functools
 import json
+import operator
 import types
 import typing
 from collections.abc import Callable
@@ -25,7 +26,8 @@ def dumps(value: Any) -> str:
 
 def plain(value: Any) -> dict[str, Any]:
     """What JSON knows of a dataclass, for any encoder; the caller must not change it."""
-    table: dict[str, Any] = _writer(type(value))(value)
+    hint: Any = type(value)
+    table: dict[str, Any] = _writer(hint)(value)
     return table
 
 
@@ -44,8 +46,9 @@ def build(cls: type[T], value: Any) -> T:
     Raises:
         ValueError: it is not of this class.
     """
+    hint: Any = cls
     try:
-        return typing.cast("T", _builder(cls)(value))
+        return typing.cast("T", _builder(hint)(value))
     except (AttributeError, TypeError, KeyError, IndexError) as error:
         raise ValueError(f"not a {cls.__name__}: {error}") from error
 
@@ -84,9 +87,9 @@ def _writer(hint: Any) -> Callable[[Any], Any]:
         each = _writer(arguments[0])
         return lambda value: sorted(each(item) for item in value)
     if isinstance(hint, type) and issubclass(hint, enum.Flag):
-        return lambda value: value.value
+        return operator.attrgetter("_value_")  # `value` and `name` are slow properties
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        return lambda value: value.name
+        return operator.attrgetter("_name_")
     if dataclasses.is_dataclass(hint):
         return _record_writer(hint)
     return _number if hint is float else _same
@@ -103,15 +106,29 @@ def _tuple_writer(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
 
 
 def _record_writer(cls: Any) -> Callable[[Any], Any]:
-    """Much of a record is the very object of the cycle before, so what it became last is kept."""
-    writers = [(name, _writer(hint)) for name, hint in fields(cls).items()]
+    """Much of a record is the very object of the cycle before, so what it became last is kept.
+
+    This runs for all of a record in every cycle: fields are taken together, and only those that JSON does not know
+    are looked at one by one.
+    """
+    kinds = fields(cls)
+    names = tuple(kinds)
+    get = operator.attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
+    numbers = tuple(name for name, hint in kinds.items() if hint is float)
+    others = [(name, write) for name, hint in kinds.items() if hint is not float and (write := _writer(hint)) != _same]
     last: tuple[Any, Any] = (None, None)
 
     def write(value: Any) -> Any:
         nonlocal last
         seen, table = last
         if value is not seen:
-            table = {name: write_field(getattr(value, name)) for name, write_field in writers}
+            table = dict(zip(names, get(value), strict=True))
+            for name, write_field in others:
+                table[name] = write_field(table[name])
+            for name in numbers:
+                number = table[name]
+                if number - number != 0.0:
+                    table[name] = repr(number)
             last = (value, table)
         return table
 

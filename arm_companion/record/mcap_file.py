@@ -60,7 +60,7 @@ class McapFile:
     def close(self) -> None:
         """Write index and end."""
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._stream.close()
 

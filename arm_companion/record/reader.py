@@ -119,7 +119,7 @@ def _versions(path: Path) -> dict[str, str]:
             raise RecordError(f"{path}: not an MCAP file") from None
         except (McapError, EndOfFile, OSError, ValueError, ArithmeticError, LookupError):
             raise RecordError(f"{path}: cut off before its first cycle") from None
-        except Exception as error:  # struct.error and what else damaged bytes lead to
+        except Exception as error:  # noqa: BLE001 - struct.error and what else damaged bytes lead to
             raise RecordError(f"{path}: damaged at its beginning: {error}") from None
     raise RecordError(f"{path}: an MCAP file, but not a record of arm-companion")
 

@@ -58,7 +58,8 @@ def schema(hint: Any) -> dict[str, Any]:
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
         return _STRING
     if dataclasses.is_dataclass(hint):
-        return {"type": "object", "properties": {name: schema(inner) for name, inner in fields(hint).items()}}
+        kind: Any = hint
+        return {"type": "object", "properties": {name: schema(inner) for name, inner in fields(kind).items()}}
     return {"type": {float: "number", int: "integer", bool: "boolean"}.get(hint, "string")}
 
 

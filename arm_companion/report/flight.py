@@ -10,10 +10,13 @@ from arm_companion.config.schema import Config
 from arm_companion.config.table import from_table
 from arm_companion.errors import ConfigError, RecordError
 from arm_companion.geometry.arrays import Array
+from arm_companion.mission.facts import ArmFault
+from arm_companion.mission.state import MOVES_VEHICLE
 from arm_companion.record.reader import Reader
 from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, LOG, TRANSITIONS, TRUTH
 
 _PERIOD_NS: Final = 50_000_000
+_FLYING: Final = frozenset(phase.name for phase in MOVES_VEHICLE)
 _NAN3: Final = [float("nan")] * 3
 _LEVELS: Final = {5: "critical", 4: "error", 3: "warning"}
 
@@ -161,8 +164,8 @@ class _Collected:
             torque_sigma=_array([w["torque_sigma"] for w in wrench]),
             tension=_array([[x["tension"] for x in f["tendons"]] for f in facts]),
             tension_best=_array([[x["tension"] for x in c["tensions"]] for c in commands]),
-            temperature=_array([[x["temperature"] for x in f["tendons"]] for f in facts]),
-            voltage=_array([[x["voltage"] for x in f["tendons"]] for f in facts]),
+            temperature=_array([[_heard(x, "temperature") for x in f["tendons"]] for f in facts]),
+            voltage=_array([[_heard(x, "voltage") for x in f["tendons"]] for f in facts]),
             servo_age=_array([[x["age_s"] for x in f["tendons"]] for f in facts]),
             ages={
                 "autopilot": _array([v["heartbeat_age_s"] for v in vehicle]),
@@ -204,13 +207,16 @@ def _array(values: list[Any]) -> Array:
         return np.array(numbers, dtype=float)
 
 
-def _faults(commands: list[dict[str, Any]]) -> list[str]:
-    """Names of all error bits that were seen after the start-up."""
-    from arm_companion.mission.facts import ArmFault  # noqa: PLC0415
+def _heard(tendon: dict[str, Any], name: str) -> Any:
+    """A servo's value, once there has been one."""
+    return tendon[name] if isinstance(tendon["age_s"], float) else float("nan")
 
+
+def _faults(commands: list[dict[str, Any]]) -> list[str]:
+    """Names of all error bits that were seen while the arm flew a perch."""
     bits = 0
     for table in commands:
-        if table["status"]["state"] not in {"STARTUP", "STOWED"}:
+        if table["status"]["state"] in _FLYING:
             bits |= table["status"]["error_bits"]
     return [fault.name.replace("_", " ").lower() for fault in ArmFault if fault.name and fault.value & bits]
 

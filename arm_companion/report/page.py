@@ -24,7 +24,7 @@ figure { margin: 0; } figure img { width: 100%; height: auto; display: block; }
 figcaption b { display: block; } figcaption { font-size: .9rem; color: #52606d; margin-bottom: .3rem; }
 .wide { overflow-x: auto; } table { border-collapse: collapse; width: 100%; font-size: .92rem; }
 th, td { text-align: left; padding: .3rem .6rem .3rem 0; border-bottom: 1px solid #e5e7eb; vertical-align: top; }
-td:first-child { white-space: nowrap; font-variant-numeric: tabular-nums; }
+td:first-child, td:nth-child(3):not(:last-child) { white-space: nowrap; font-variant-numeric: tabular-nums; }
 .critical td, .error td { color: #b91c1c; font-weight: 600; } .warning td { color: #b45309; font-weight: 600; }
 details summary { cursor: pointer; } details td { overflow-wrap: anywhere; }
 """
@@ -51,7 +51,7 @@ def page(flight: RecordedFlight, verdict: Verdict, pictures: Sequence[Picture], 
 <div class="verdict {verdict.grade}"><strong>{_WORDS[verdict.grade]}: {_text(verdict.headline)}</strong>
 <ul>{points}</ul></div>
 <h2>States</h2>{_timeline(flight.spans, flight.seconds)}
-{_table(("at", "state", "for", "because"), (("", (f"{s.begin:.2f} s", s.name, f"{s.end - s.begin:.1f} s", s.cause)) for s in flight.spans))}
+{_states(flight.spans)}
 <h2>Warnings</h2>{_sentences(warnings) if warnings else "<p>None.</p>"}
 <h2>Pictures</h2><p class="sub">Yellow: perched. Drawn at 20 Hz; the record has every cycle.</p>
 <div class="pictures">{shown}</div>
@@ -60,6 +60,11 @@ def page(flight: RecordedFlight, verdict: Verdict, pictures: Sequence[Picture], 
 {_table(("what", "value"), (("", item) for item in flight.versions.items()))}</details>
 </body></html>
 """
+
+
+def _states(spans: Sequence[Span]) -> str:
+    rows = (("", (f"{s.begin:.2f} s", s.name, f"{s.end - s.begin:.1f} s", s.cause)) for s in spans)
+    return _table(("at", "state", "for", "because"), rows)
 
 
 def _timeline(spans: Sequence[Span], seconds: float) -> str:

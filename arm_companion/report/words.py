@@ -87,8 +87,8 @@ def _figures(flight: RecordedFlight) -> list[str]:
     figures = [
         f"greatest tendon tension {_most(flight.tension):.1f} N",
         f"hottest servo {_most(flight.temperature):.0f} °C, lowest voltage {-_most(-flight.voltage):.1f} V",
-        f"greatest predicted force on the airframe {_most(np.linalg.norm(flight.force_b, axis=1)):.1f} N, "
-        f"torque {_most(np.linalg.norm(flight.torque_b, axis=1)):.2f} N m",
+        f"greatest predicted force on the airframe {_most(np.linalg.norm(flight.force_b, axis=1)):.1f} N",
+        f"greatest predicted torque {_most(np.linalg.norm(flight.torque_b, axis=1)):.2f} N m",
     ]
     if np.isfinite(error).any():
         figures.append(f"vehicle off its set-point by {1e3 * float(np.nanmedian(error)):.0f} mm (median)")
