@@ -16,6 +16,8 @@ _COMMANDS = {
     "calibrate": "tendons and tensions on the bench, the model from measurements",
     "servos": "find, set up and watch the servos",
     "jog": "bend the arm from the keyboard, while no daemon runs",
+    "replay": "run a recorded flight through today's code, or ask what would have been",
+    "report": "one page of a recorded flight, for people",
     "config": "check or show a configuration",
 }
 

@@ -6,8 +6,6 @@ import dataclasses
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from datetime import UTC, datetime
-from pathlib import Path
 
 from arm_companion.arm import compiled
 from arm_companion.arm.model import ArmModel
@@ -34,7 +32,9 @@ from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice,
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
-from arm_companion.recorder import FileRecorder, NoRecorder, Record, Recorder
+from arm_companion.record import configured_recorder
+from arm_companion.record.raw import tapped
+from arm_companion.record.recorder import Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
 from arm_companion.transport.urls import open_bus, open_url
@@ -96,7 +96,9 @@ class Daemon:
         self._config = config
         self._clock = clock
         self._manager = manager
-        self._recorder = _recorder(config, clock) if recorder is None else recorder
+        self._recorder = configured_recorder(config, clock) if recorder is None else recorder
+        self._recorder.configure(clock.now(), config)
+        openers = self._tap(openers)
         self._compiled_model = compiled_model
         self._parameters = Parameters(config, model or RodModel(ArmParameters.of(config.arm)))
         self._links = [
@@ -121,6 +123,7 @@ class Daemon:
             settings=self._settings,
             on_power=self._end,
         )
+        self._component.on_notice = lambda notice: self._recorder.notice(clock.now(), notice)
         self.vehicle_check = VehicleCheck(
             autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
         )
@@ -184,6 +187,14 @@ class Daemon:
                 self._keeper.close()
                 self._recorder.close()
 
+    def _tap(self, openers: Openers) -> Openers:
+        """The openers with what passes told to the recorder, if it wants that."""
+        if not self._recorder.raw:
+            return openers
+        now = self._clock.now
+        links = {name: tapped(opener, f"mavlink/{name}", self._recorder, now) for name, opener in openers.links.items()}
+        return Openers(links, tapped(openers.servos, "servos", self._recorder, now))
+
     async def _prepare_model(self) -> None:
         """The compiled mechanics from numba's cache, where there are any; links and heartbeats run meanwhile.
 
@@ -209,6 +220,8 @@ class Daemon:
     async def _cycles(self) -> None:
         if self._compiled_model:
             await self._prepare_model()
+        if isinstance(self._parameters.model, RodModel):
+            self._recorder.mechanics("numba" if self._parameters.model.fast else "numpy")
         self._manager.ready()
         for warning in self._calibrated.warnings:
             log.warning("%s", warning)
@@ -232,6 +245,9 @@ class Daemon:
         self._state, commands = step(before, facts, now, self._parameters)
         await self._act(commands, facts, now)
         self._recorder.put(Record(now, facts, before, commands))
+        for text in self._recorder.troubles():
+            log.warning("%s", text)
+            self._component.notify(Notice(Severity.WARNING, text))
 
     async def _observe(self) -> Facts:
         servos = await self._bus.read()
@@ -340,6 +356,7 @@ class Daemon:
             self._tendons = self._calibrated.tendons(config)
             self._component.set_limits(config.limits)
         self._config = config
+        self._recorder.configure(self._clock.now(), config)
         self._parameters = Parameters(config, self._parameters.model)
         self._telemetry.set_rates(config.rates)
 
@@ -347,12 +364,3 @@ class Daemon:
         """Stop in an orderly way, a moment later: the answer to whoever asked has to leave first."""
         self.power = power
         asyncio.get_running_loop().call_later(_FAREWELL_S, self._stop.set)
-
-
-def _recorder(config: Config, clock: Clock) -> Recorder:
-    if config.record.file:
-        return FileRecorder(Path(config.record.file))
-    if not config.record.directory:
-        return NoRecorder()
-    start = datetime.fromtimestamp(clock.unix(clock.now()), UTC)
-    return FileRecorder(Path(config.record.directory) / f"{start:%Y%m%d-%H%M%S}.jsonl")

@@ -19,6 +19,10 @@ class ProtocolError(ArmError):
     """Bytes that do not follow the protocol: counted and dropped when remote, a bug when local."""
 
 
+class RecordError(ArmError):
+    """A file is no record, or not one that this version reads."""
+
+
 class DeviceFault(ArmError):
     """A servo reports a hardware fault or does not answer: a row of the failure table decides.
 

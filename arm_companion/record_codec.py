@@ -1,9 +1,14 @@
-"""Dataclasses <-> JSON text, exactly: floats keep every bit, and types come from annotations."""
+"""Dataclasses <-> JSON text, exactly: floats keep every bit, and types come from annotations.
+
+JSON has no numbers for what is not finite; these are the strings "nan", "inf" and "-inf", so that every reader of
+JSON takes the text.
+"""
 
 import dataclasses
 import enum
 import functools
 import json
+import operator
 import types
 import typing
 from collections.abc import Callable
@@ -16,74 +21,154 @@ UNRECORDED = {"unrecorded": True}
 
 def dumps(value: Any) -> str:
     """One line of JSON for a dataclass made of plain values, tuples, enums and other such dataclasses."""
-    return json.dumps(_plain(value), separators=(",", ":"))
+    return json.dumps(plain(value), separators=(",", ":"))
 
 
-def loads(cls: type[T], text: str) -> T:
+def plain(value: Any) -> dict[str, Any]:
+    """What JSON knows of a dataclass, for any encoder; the caller must not change it."""
+    hint: Any = type(value)
+    table: dict[str, Any] = _writer(hint)(value)
+    return table
+
+
+def loads(cls: type[T], text: str | bytes) -> T:
     """The value that `dumps` wrote.
 
     Raises:
         ValueError: the text is not such a value.
     """
+    return build(cls, json.loads(text))
+
+
+def build(cls: type[T], value: Any) -> T:
+    """The value that stands in JSON as `value`.
+
+    Raises:
+        ValueError: it is not of this class.
+    """
+    hint: Any = cls
     try:
-        return typing.cast("T", _build(cls, json.loads(text)))
-    except (TypeError, KeyError, IndexError) as error:
+        return typing.cast("T", _builder(hint)(value))
+    except (AttributeError, TypeError, KeyError, IndexError) as error:
         raise ValueError(f"not a {cls.__name__}: {error}") from error
 
 
 @functools.cache
-def _names(cls: Any) -> tuple[str, ...]:
-    return tuple(f.name for f in dataclasses.fields(cls) if f.metadata != UNRECORDED)
+def fields(cls: Any) -> dict[str, Any]:
+    """Names and types of the fields of a dataclass that are in its text."""
+    hints = typing.get_type_hints(cls)
+    return {f.name: hints[f.name] for f in dataclasses.fields(cls) if f.metadata != UNRECORDED}
+
+
+def _number(value: float) -> float | str:
+    return value if value - value == 0.0 else repr(value)
+
+
+def _numbers(value: tuple[float, ...]) -> Any:
+    total = sum(value)
+    return value if total - total == 0.0 else [_number(number) for number in value]
+
+
+def _same(value: Any) -> Any:
+    return value
 
 
 @functools.cache
-def _hints(cls: Any) -> dict[str, Any]:
-    return typing.get_type_hints(cls)
-
-
-def _plain(value: Any) -> Any:
-    kind: Any = type(value)
-    return _writer(kind)(value)
-
-
-@functools.cache
-def _writer(kind: Any) -> Callable[[Any], Any]:
-    """What turns a value of exactly this type into what JSON knows; found out once for each type."""
-    if kind in (float, int, str, bool, type(None)):
-        return lambda value: value
-    if issubclass(kind, enum.Flag):
-        return lambda value: value.value
-    if issubclass(kind, enum.Enum):
-        return lambda value: value.name
-    if issubclass(kind, (tuple, list)):
-        return lambda value: [item if type(item) is float else _plain(item) for item in value]
-    if issubclass(kind, frozenset):
-        return lambda value: sorted(_plain(item) for item in value)
-    names = _names(kind)
-    return lambda value: {name: _plain(getattr(value, name)) for name in names}
-
-
-def _build(hint: Any, value: Any) -> Any:
+def _writer(hint: Any) -> Callable[[Any], Any]:
+    """What turns a value of this type into what JSON knows; found out once for each type."""
     origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
     if origin in (types.UnionType, typing.Union):
-        if value is None:
-            return None
-        (hint,) = (a for a in typing.get_args(hint) if a is not type(None))
-        return _build(hint, value)
+        (inner,) = (_writer(a) for a in arguments if a is not type(None))
+        return lambda value: None if value is None else inner(value)
     if origin is tuple:
-        inner = typing.get_args(hint)
-        if len(inner) == 2 and inner[1] is Ellipsis:  # tuple[x, ...]
-            return tuple(_build(inner[0], item) for item in value)
-        return tuple(_build(h, item) for h, item in zip(inner, value, strict=True))
+        return _tuple_writer(arguments)
     if origin is frozenset:
-        return frozenset(_build(typing.get_args(hint)[0], item) for item in value)
+        each = _writer(arguments[0])
+        return lambda value: sorted(each(item) for item in value)
+    if isinstance(hint, type) and issubclass(hint, enum.Flag):
+        return operator.attrgetter("_value_")  # `value` and `name` are slow properties
     if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        return hint(value) if issubclass(hint, enum.Flag) else hint[value]
+        return operator.attrgetter("_name_")
     if dataclasses.is_dataclass(hint):
-        return _make(hint, value)
-    return hint(value) if hint is float else value
+        return _record_writer(hint)
+    return _number if hint is float else _same
 
 
-def _make(cls: Any, table: dict[str, Any]) -> Any:
-    hints = _hints(cls)
-    return cls(**{name: _build(hints[name], item) for name, item in table.items()})
+def _tuple_writer(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
+    if set(inner) <= {float, Ellipsis}:
+        return _numbers
+    if len(inner) == 2 and inner[1] is Ellipsis:  # tuple[x, ...]
+        each = _writer(inner[0])
+        return lambda value: [each(item) for item in value]
+    writers = [_writer(hint) for hint in inner]
+    return lambda value: [write(item) for write, item in zip(writers, value, strict=True)]
+
+
+def _record_writer(cls: Any) -> Callable[[Any], Any]:
+    """Much of a record is the very object of the cycle before, so what it became last is kept.
+
+    This runs for all of a record in every cycle: fields are taken together, and only those that JSON does not know
+    are looked at one by one.
+    """
+    kinds = fields(cls)
+    names = tuple(kinds)
+    get = operator.attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
+    numbers = tuple(name for name, hint in kinds.items() if hint is float)
+    others = [(name, write) for name, hint in kinds.items() if hint is not float and (write := _writer(hint)) != _same]
+    last: tuple[Any, Any] = (None, None)
+
+    def table_of(value: Any) -> Any:
+        nonlocal last
+        seen, table = last
+        if value is not seen:
+            table = dict(zip(names, get(value), strict=True))
+            for name, write_field in others:
+                table[name] = write_field(table[name])
+            for name in numbers:
+                number = table[name]
+                if number - number != 0.0:
+                    table[name] = repr(number)
+            last = (value, table)
+        return table
+
+    return table_of
+
+
+@functools.cache
+def _builder(hint: Any) -> Callable[[Any], Any]:
+    """What turns JSON into a value of this type; found out once for each type."""
+    origin = typing.get_origin(hint)
+    arguments = typing.get_args(hint)
+    if origin in (types.UnionType, typing.Union):
+        (inner,) = (_builder(a) for a in arguments if a is not type(None))
+        return lambda value: None if value is None else inner(value)
+    if origin is tuple:
+        return _tuple_builder(arguments)
+    if origin is frozenset:
+        each = _builder(arguments[0])
+        return lambda value: frozenset(each(item) for item in value)
+    if hint is float or (isinstance(hint, type) and issubclass(hint, enum.Flag)):
+        return typing.cast("Callable[[Any], Any]", hint)
+    if isinstance(hint, type) and issubclass(hint, enum.Enum):
+        return hint.__getitem__
+    if dataclasses.is_dataclass(hint):
+        return _record_builder(hint)
+    return _same
+
+
+def _tuple_builder(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
+    if len(inner) == 2 and inner[1] is Ellipsis:  # tuple[x, ...]
+        each = _builder(inner[0])
+        return lambda value: tuple([each(item) for item in value])
+    builders = [_builder(hint) for hint in inner]
+    return lambda value: tuple([make(item) for make, item in zip(builders, value, strict=True)])
+
+
+def _record_builder(cls: Any) -> Callable[[Any], Any]:
+    builders = {name: _builder(hint) for name, hint in fields(cls).items()}
+
+    def make(table: dict[str, Any]) -> Any:
+        return cls(**{name: builders[name](item) for name, item in table.items()})
+
+    return make

@@ -54,6 +54,8 @@ class RodModel(UnloadedArm):
         self._slack = sealed(parameters.T0 / parameters.k_T)  # stretch at zero pull
         self._rods: dict[tuple[float, int], Rod] = {}
         self._make: type[Rod] = Rod
+        self.fast = fast
+        """Whether it is compiled."""
         if fast:
             from arm_companion.arm.fast import FastRod  # noqa: PLC0415 - numba is optional, and slow to import
 

@@ -1,12 +1,10 @@
 """`arm-companion config`: check or show a configuration."""
 
 import argparse
-import dataclasses
 import json
-from collections.abc import Mapping
-from typing import Any
 
 from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.config.table import as_table
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,15 +17,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Check the configuration and, when asked, print all of its values."""
     config = load_from(arguments)
     if arguments.action == "show":
-        print(json.dumps(_plain(config), indent=2))
+        print(json.dumps(as_table(config), indent=2))
     else:
         print(f"{arguments.config}: usable")
     return 0
-
-
-def _plain(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value

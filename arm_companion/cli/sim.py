@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="for log and figure (default: build/sim)",
     )
     parser.add_argument(
-        "--log", type=Path, metavar="FILE", help="write the daemon's record here (default: DIR/record.jsonl)"
+        "--log", type=Path, metavar="FILE", help="write the daemon's record here (default: DIR/record.mcap)"
     )
 
 
@@ -68,7 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.trials is not None and not (arguments.simulated and arguments.scenario == "perch"):
         print("arm-companion sim: --trials flies the perch in simulated time: sim perch --simulated", file=sys.stderr)
         return 2
-    for name in ("matplotlib", "mujoco", "rich"):
+    for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
             return 2
@@ -122,6 +122,7 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     log = output / "events.log"
     start = result.flight.samples[0].t if result.flight.samples else 0.0
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
+    _write_truth(arguments, result.flight)
     show_verdict(verdict, progress.console, [figure, log, _record_path(arguments)])
     if arguments.json:
         wall = time.perf_counter() - started
@@ -156,22 +157,26 @@ def _trials(arguments: argparse.Namespace, config: Config) -> int:
     return 0 if summary.success == len(summary.outcomes) else 1
 
 
+def _write_truth(arguments: argparse.Namespace, flight: Any) -> None:
+    """Beside the record, where `report` looks for it."""
+    from arm_companion.clock import SIMULATED_EPOCH_S, unix_now  # noqa: PLC0415
+    from arm_companion.record.reader import truth_beside  # noqa: PLC0415
+    from arm_companion.sim.truth import write_truth  # noqa: PLC0415
+
+    offset = SIMULATED_EPOCH_S if arguments.simulated else unix_now() - time.perf_counter()
+    write_truth(truth_beside(_record_path(arguments)), flight.samples, lambda t: t + offset)
+
+
 def _record_path(arguments: argparse.Namespace) -> Path:
-    path: Path = arguments.log or arguments.output / "record.jsonl"
+    path: Path = arguments.log or arguments.output / "record.mcap"
     return path
 
 
 def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
-    from arm_companion.record_codec import dumps  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    result = run_simulated(fly_simulated(config, progress.say))
-    path = _record_path(arguments)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8") as stream:
-        stream.writelines(dumps(record) + "\n" for record in result.records)
-    return result
+    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments)))
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:

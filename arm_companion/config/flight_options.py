@@ -99,6 +99,17 @@ class RecordConfig:
 
     directory: str = option("where records go, one file a start; empty: none unless `file` is set", "")
     file: str = option("this very file instead, overwritten at each start", "")
+    part_mb: float = option("a record goes on in another file beyond this size", 200.0, unit="MB", lower=1.0, upper=1e5)
+    budget_mb: float = option(
+        "most that all records of the directory take, the oldest are deleted; 0: any",
+        4000.0,
+        unit="MB",
+        upper=1e7,
+        lower=0.0,
+    )
+    keep_free_mb: float = option("space that records leave free on the disk", 200.0, unit="MB", lower=0.0, upper=1e6)
+    raw: bool = option("whether the raw bytes of all links and of the servo bus are recorded", default=True)
+    raw_kb_per_s: float = option("most of those bytes that are kept", 200.0, unit="kB/s", lower=1.0, upper=1e4)
 
 
 @dataclass(frozen=True)

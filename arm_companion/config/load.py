@@ -28,7 +28,7 @@ def load(file: str | Path, settings: Iterable[str] = ()) -> Config:
     table = _read_with_bases(path, ())
     source = path.name
     for setting in settings:
-        _apply(table, setting)
+        apply_setting(table, setting)
         source = f"{path.name} with --set"
     return read(Config, table, source)
 
@@ -79,7 +79,12 @@ def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     return merged
 
 
-def _apply(table: dict[str, Any], setting: str) -> None:
+def apply_setting(table: dict[str, Any], setting: str) -> None:
+    """Put one `section.key=value` into a table.
+
+    Raises:
+        ConfigError: it is not of that form.
+    """
     key, equals, text = setting.partition("=")
     if not equals or not key.strip():
         raise ConfigError(f"--set {setting}: expected KEY=VALUE")

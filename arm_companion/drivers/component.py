@@ -86,6 +86,8 @@ class Component:
         mavlink = MavlinkConfig() if mavlink is None else mavlink
         limits = LimitsConfig() if limits is None else limits
         self.counters = ComponentCounters()
+        self.on_notice: Callable[[Notice], None] = lambda _: None
+        """Told of every sentence for everybody."""
         self.status = SystemStatus.BOOT
         """What the heartbeat says of us."""
         self._links = links
@@ -147,6 +149,7 @@ class Component:
 
     def notify(self, notice: Notice) -> None:
         """Tell everybody."""
+        self.on_notice(notice)
         self._speaker.say(notice)
 
     async def run(self) -> None:

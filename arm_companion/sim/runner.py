@@ -17,7 +17,8 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock
 from arm_companion.config.schema import Config
 from arm_companion.errors import ArmError
-from arm_companion.recorder import MemoryRecorder, Record
+from arm_companion.record import file_recorder
+from arm_companion.record.recorder import Both, MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
 from arm_companion.sim.scenario import Operator, Say
@@ -48,7 +49,12 @@ class DaemonDied(ArmError):
 
 
 async def fly_simulated(
-    config: Config, say: Say, prepare: Prepare = lambda _: None, *, world: Config | None = None
+    config: Config,
+    say: Say,
+    prepare: Prepare = lambda _: None,
+    log: Path | None = None,
+    *,
+    world: Config | None = None,
 ) -> Result:
     """One perch on the running simulated loop: every part in this process, over in-memory pipes.
 
@@ -56,13 +62,15 @@ async def fly_simulated(
         config: the daemon's.
         say: told what happens.
         prepare: changes the world before the flight.
+        log: where the daemon's record goes.
         world: how the world is, where it differs from what the daemon believes.
     """
     companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
     plant = World(config if world is None else world)
     prepare(plant)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
-    recorder = MemoryRecorder()
+    memory = MemoryRecorder()
+    recorder = memory if log is None else Both(memory, file_recorder(log, config, clock, patient=True))
     openers = Openers(
         {
             name: companion.opener(1) if link.role == "autopilot" else arm.opener(0)
@@ -85,7 +93,7 @@ async def fly_simulated(
         failure = await Operator(link, config, flight, say).fly_perch()
         stop.set()
         await asyncio.sleep(0.5)
-    return Result(flight, failure, daemon.cycles, daemon.missed, recorder.records)
+    return Result(flight, failure, daemon.cycles, daemon.missed, memory.records)
 
 
 def _model(config: Config) -> RodModel:

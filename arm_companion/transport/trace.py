@@ -6,8 +6,8 @@ and the bytes in hexadecimal. Lines that begin with `#` are remarks.
 
 import asyncio
 from collections import deque
-from collections.abc import Iterable
-from typing import NamedTuple, TextIO
+from collections.abc import Callable, Iterable
+from typing import NamedTuple, TextIO, TypeAlias
 
 from arm_companion.errors import ProtocolError
 from arm_companion.transport.base import Opener, Receiver, Transport
@@ -23,10 +23,14 @@ class Chunk(NamedTuple):
     data: bytes
 
 
-class _Recorded:
-    """A transport that notes what passes."""
+Note: TypeAlias = Callable[[bytes, bool], None]
+"""Told of every chunk, and whether it was sent."""
 
-    def __init__(self, inner: Transport, note: "_Notes") -> None:
+
+class _Observed:
+    """A transport that tells what passes."""
+
+    def __init__(self, inner: Transport, note: Note) -> None:
         self._inner = inner
         self._note = note
 
@@ -36,8 +40,8 @@ class _Recorded:
         return self._inner.dropped
 
     def write(self, data: bytes) -> None:
-        """Send and note."""
-        self._note.add(data, sent=True)
+        """Send and tell."""
+        self._note(data, True)
         self._inner.write(data)
 
     def close(self) -> None:
@@ -55,7 +59,7 @@ class _Notes:
         self._began: float | None = None
         stream.write(FIRST_LINE + "\n")
 
-    def add(self, data: bytes, *, sent: bool) -> None:
+    def add(self, data: bytes, sent: bool) -> None:
         now = asyncio.get_running_loop().time()
         if self._began is None:
             self._began = now
@@ -64,16 +68,20 @@ class _Notes:
 
 def recorded(opener: Opener, stream: TextIO) -> Opener:
     """An `Opener` of the same pipe that writes all that passes to `stream`, also over several openings."""
-    notes = _Notes(stream)
+    return observed(opener, _Notes(stream).add)
 
-    async def open_recorded(receiver: Receiver) -> Transport:
+
+def observed(opener: Opener, note: Note) -> Opener:
+    """An `Opener` of the same pipe that tells `note` of all that passes."""
+
+    async def open_observed(receiver: Receiver) -> Transport:
         def receive(data: bytes) -> None:
-            notes.add(data, sent=False)
+            note(data, False)
             receiver(data)
 
-        return _Recorded(await opener(receive), notes)
+        return _Observed(await opener(receive), note)
 
-    return open_recorded
+    return open_observed
 
 
 def read_trace(lines: Iterable[str]) -> list[Chunk]:

@@ -16,7 +16,7 @@ from arm_companion.ground.commands import CommandFailed
 from arm_companion.ground.reports import Status, Tendons, Wrench
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec, Message
-from arm_companion.recorder import NoRecorder
+from arm_companion.record.recorder import Recorder
 from arm_companion.sim.servo_emulator import EmulatedBus
 from arm_companion.sim.world import World
 from arm_companion.supervisor import ServiceManager
@@ -65,7 +65,7 @@ async def flying(flavour: str) -> AsyncIterator[Ground]:
         servos.opener(1),
     )
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
-    daemon = Daemon(config, openers, clock, ServiceManager(""), NoRecorder())
+    daemon = Daemon(config, openers, clock, ServiceManager(""), Recorder())
     bus, ground, stop = EmulatedBus(world.servos, config.servos), Ground(), asyncio.Event()
     parts = (
         world.run(),

@@ -14,7 +14,7 @@ from arm_companion.drivers import calibration_files as files
 from arm_companion.drivers.calibration import VERSION, ServoIdentity, TendonCalibration, TendonZero
 from arm_companion.mission.facts import CalibrationState
 from arm_companion.protocol.dialect import mav
-from arm_companion.recorder import MemoryRecorder
+from arm_companion.record.recorder import MemoryRecorder
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.memory import MemoryPipe

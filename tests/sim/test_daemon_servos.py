@@ -13,7 +13,7 @@ from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
-from arm_companion.recorder import MemoryRecorder
+from arm_companion.record.recorder import MemoryRecorder
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.memory import MemoryPipe

@@ -1,17 +1,23 @@
 """Whole flights in simulated time: plant, autopilot stand-in, servos and daemon, joined by bytes alone."""
 
+import atexit
 import functools
+import json
+import shutil
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
-from arm_companion.arm.parameters import ArmParameters
-from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
-from arm_companion.mission.situation import Parameters
-from arm_companion.record_codec import dumps
-from arm_companion.recorder import replay
+from arm_companion.mission.state import State
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.record.reader import Item, Reader
+from arm_companion.record.replay import replay
+from arm_companion.record.topics import COMMANDS, FACTS, LOG, RAW, STATE, TRANSITIONS
+from arm_companion.record_codec import dumps, loads
 from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.verdict import Verdict, judge
 from arm_companion.sim.world import World
@@ -19,16 +25,26 @@ from arm_companion.sim.world import World
 CONFIG = load("sim.toml")
 
 
-def fly(prepare: Callable[[World], None] = lambda _: None, settings: tuple[str, ...] = ()) -> tuple[Result, Verdict]:
+def fly(
+    prepare: Callable[[World], None] = lambda _: None, settings: tuple[str, ...] = (), record: Path | None = None
+) -> tuple[Result, Verdict]:
     config = load("sim.toml", settings)
-    result = run_simulated(fly_simulated(config, lambda _: None, prepare))
+    result = run_simulated(fly_simulated(config, lambda _: None, prepare, record))
     return result, judge(result.flight, result.failure)
 
 
 @functools.cache
 def perch() -> tuple[Result, Verdict]:
     """The undisturbed flight, flown once for all who look at it."""
-    return fly()
+    return fly(record=log())
+
+
+@functools.cache
+def log() -> Path:
+    """Where its record is."""
+    directory = Path(tempfile.mkdtemp(prefix="arm-companion-"))
+    atexit.register(shutil.rmtree, directory, ignore_errors=True)
+    return directory / "record.mcap"
 
 
 def phases(result: Result) -> list[str]:
@@ -103,14 +119,31 @@ def test_the_predicted_wrench_is_the_plants() -> None:
 def test_no_cycle_is_missed_and_replay_gives_the_same_commands_bit_for_bit() -> None:
     result, _ = perch()
     assert result.missed == 0
-    count, different = replay(result.records[:6000], Parameters(CONFIG, RodModel(ArmParameters.of(CONFIG.arm))))
-    assert different is None, f"cycle {count}"
-    assert count == min(len(result.records), 6000)
+    reader = Reader(log())
+    outcome = replay(reader)
+    assert outcome.identical, outcome.first
+    assert outcome.cycles == len(result.records)
+    assert not outcome.remarks
+    assert not outcome.gaps
 
 
-def test_the_record_keeps_every_field_of_every_cycle() -> None:
+def test_the_record_has_every_cycle_every_frame_and_every_sentence() -> None:
     result, _ = perch()
-    assert all(len(dumps(record)) > 500 for record in result.records[::500])
+    found: dict[str, list[Item]] = {}
+    for item in Reader(log()):
+        found.setdefault(item.topic, []).append(item)
+    assert len(found[FACTS]) == len(found[STATE]) == len(found[COMMANDS]) == len(result.records)
+    for record, item in zip(result.records[::500], found[STATE][::500], strict=True):
+        assert dumps(loads(State, item.data)) == dumps(record.state)
+    passed = [json.loads(item.data)["after"] for item in found[TRANSITIONS]]
+    assert passed == [phase for phase in phases(result) if phase != "STARTUP"]
+    said = [json.loads(item.data)["message"] for item in found[LOG]]
+    assert {notice.text for record in result.records for notice in record.commands.notices} <= set(said)
+    for pipe in ("servos", "mavlink/autopilot", "mavlink/ground"):
+        assert len(found[f"{RAW}{pipe}/sent"]) > 100, pipe
+    codec = MavlinkCodec(255, 190)
+    heard = [m for item in found[f"{RAW}mavlink/autopilot/received"] for m in codec.feed(item.data)]
+    assert {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= {message.get_type() for message in heard}
 
 
 def test_a_bar_ten_centimetres_out_of_reach_is_reported_and_the_vehicle_comes_home() -> None:

@@ -23,7 +23,7 @@ from arm_companion.mission.state import Phase
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec
 from arm_companion.protocol.tunnel import tunnel
-from arm_companion.recorder import MemoryRecorder
+from arm_companion.record.recorder import MemoryRecorder
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.memory import MemoryPipe
 from tests.conftest import MavlinkPeer

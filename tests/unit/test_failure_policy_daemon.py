@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from arm_companion.recorder import FileRecorder, Record
 
 from arm_companion.clock import run_simulated
 from arm_companion.config.parameters import PARAMETERS, When
@@ -14,7 +15,6 @@ from arm_companion.mission.failure_policy import SITUATIONS
 from arm_companion.mission.mission import step
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import Phase
-from arm_companion.recorder import FileRecorder, Record
 from tests.unit.mission_rig import BENT, HELD, T0, memory
 from tests.unit.test_daemon_services import config, running
 

@@ -1,0 +1,59 @@
+"""`arm-companion report`: one page of a recorded flight."""
+
+import argparse
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+from arm_companion.record import require
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of `arm-companion report`."""
+    parser.add_argument("log", type=Path, metavar="LOG", help="a record (*.mcap); the parts that follow it come along")
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="for report.html and the PNGs (default: LOG without .mcap)"
+    )
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="the simulator's truth (default: beside LOG)")
+    parser.add_argument("--title", help="headline of the page (default: the record's name)")
+    parser.add_argument("--json", action="store_true", help="print the verdict as one JSON object")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write the page and its pictures."""
+    require()
+    if importlib.util.find_spec("matplotlib") is None:
+        print("arm-companion report needs 'matplotlib': pip install 'arm-companion[report]'", file=sys.stderr)
+        return 2
+    from arm_companion.record.reader import Reader, truth_beside  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.report.figures import pictures  # noqa: PLC0415
+    from arm_companion.report.flight import read  # noqa: PLC0415
+    from arm_companion.report.page import page  # noqa: PLC0415
+    from arm_companion.report.words import judge  # noqa: PLC0415
+
+    log: Path = arguments.log
+    beside = truth_beside(log)
+    truth: Path | None = arguments.truth or (beside if beside.is_file() else None)
+    flight = read(Reader(log), Reader(truth) if truth is not None else None)
+    verdict = judge(flight)
+    output: Path = arguments.output or log.with_suffix("")
+    drawn = pictures(flight)
+    file = output / "report.html"
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+        for picture in drawn:
+            (output / f"{picture.name}.png").write_bytes(picture.png)
+        file.write_text(page(flight, verdict, drawn, arguments.title or f"Flight {log.stem}"), encoding="utf-8")
+    except OSError as error:
+        print(f"arm-companion report: {error}", file=sys.stderr)
+        return 1
+    if arguments.json:
+        found = {"grade": verdict.grade, "headline": verdict.headline, "points": verdict.points, "page": str(file)}
+        print(json.dumps(found))
+    else:
+        print(verdict.headline)
+        for point in verdict.points:
+            print(f"  {point}")
+        print(file)
+    return 0

@@ -1,0 +1,56 @@
+"""The record of a flight: an MCAP file that today's code can be run against, and that Foxglove and PlotJuggler read."""
+
+import importlib.util
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from arm_companion.clock import Clock
+from arm_companion.config.schema import Config
+from arm_companion.errors import ConfigError, RecordError
+from arm_companion.record.recorder import Recorder
+
+_NEEDS: Final = ("mcap", "orjson")
+
+
+def require() -> None:
+    """That what reads and writes records is installed.
+
+    Raises:
+        RecordError: it is not; the message says what to do.
+    """
+    missing = [name for name in _NEEDS if importlib.util.find_spec(name) is None]
+    if missing:
+        raise RecordError(f"records need {' and '.join(missing)}: pip install 'arm-companion[record]'")
+
+
+def configured_recorder(config: Config, clock: Clock) -> Recorder:
+    """What [record] asks for.
+
+    Raises:
+        ConfigError: what writes records is not installed.
+    """
+    if not (config.record.file or config.record.directory):
+        return Recorder()
+    if config.record.file:
+        path = Path(config.record.file)
+    else:
+        start = datetime.fromtimestamp(clock.unix(clock.now()), UTC)
+        path = Path(config.record.directory) / f"{start:%Y%m%d-%H%M%S}.mcap"
+    return file_recorder(path, config, clock)
+
+
+def file_recorder(path: Path, config: Config, clock: Clock, *, patient: bool = False) -> Recorder:
+    """A recorder of the daemon in this file.
+
+    Raises:
+        ConfigError: what writes records is not installed.
+    """
+    try:
+        require()
+    except RecordError as error:
+        raise ConfigError(f"record: {error}") from None
+    from arm_companion.record.file_recorder import FileRecorder  # noqa: PLC0415 - of an extra
+    from arm_companion.record.versions import versions  # noqa: PLC0415
+
+    return FileRecorder(path, config.record, versions(config), clock.unix, patient=patient)

@@ -1,0 +1,131 @@
+"""Reads records: all parts in order, as far as the bytes go."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import IO, NamedTuple
+
+from mcap.exceptions import EndOfFile, InvalidMagic, McapError
+from mcap.records import Channel, Chunk, Message, Metadata
+from mcap.stream_reader import StreamReader, breakup_chunk
+
+from arm_companion.errors import RecordError
+from arm_companion.record import storage
+from arm_companion.record.topics import FORMAT, METADATA
+
+_LARGEST = 64 * 1024 * 1024
+"""No record of ours is longer; a damaged length must not ask for all the memory."""
+
+
+class Item(NamedTuple):
+    """One message as it stands in the file."""
+
+    topic: str
+    sequence: int
+    unix_ns: int
+    data: bytes
+
+
+class Reader:
+    """A record and the parts that follow it.
+
+    Args:
+        path: of the first part to read.
+
+    Attributes:
+        versions: metadata of the first part.
+        remarks: after reading: in words, what is missing or damaged.
+
+    Raises:
+        RecordError: the file cannot be read, is no record of ours or of another format.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.remarks: list[str] = []
+        self.versions = _versions(path)
+        part = self.versions.get("part", "1")
+        if part != "1":
+            self.remarks.append(f"this is part {part} of a record: what came before is not looked at")
+
+    def __iter__(self) -> Iterator[Item]:
+        """All messages."""
+        return self.messages(None)
+
+    def messages(self, topics: Collection[str] | None) -> Iterator[Item]:
+        """The messages of some channels, or of all, part by part in the order of the file."""
+        path = self.path
+        while True:
+            yield from self._part(path, topics)
+            path = storage.following(path)
+            if not path.is_file() or self.versions.get("content") == "truth":
+                return
+            if _versions(path).get("begun") != self.versions.get("begun"):
+                return
+
+    def _part(self, path: Path, topics: Collection[str] | None) -> Iterator[Item]:
+        names: dict[int, str] = {}
+        with path.open("rb") as stream:
+            records = StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records
+            while True:
+                try:
+                    record = next(records, None)
+                    inside = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else []
+                except Exception as error:  # noqa: BLE001 - damaged bytes show in any way, in zstd's as well
+                    end = isinstance(error, EndOfFile) or _at_end(stream)
+                    self.remarks.append(
+                        f"{path.name} is cut off: read up to its last whole chunk"
+                        if end
+                        else f"{path.name} is damaged at byte {stream.tell()}: read up to there"
+                    )
+                    return
+                if record is None:
+                    return
+                for entry in inside:
+                    if isinstance(entry, Channel):
+                        names[entry.id] = entry.topic
+                    elif isinstance(entry, Message):
+                        topic = names.get(entry.channel_id, "")
+                        if topics is None or topic in topics:
+                            yield Item(topic, entry.sequence, entry.log_time, entry.data)
+
+
+def truth_beside(path: Path) -> Path:
+    """Where the simulator puts the plant's truth that belongs to a record."""
+    return path.with_name(f"{path.stem}.truth.mcap")
+
+
+def _at_end(stream: IO[bytes]) -> bool:
+    return not stream.read(1)
+
+
+def _versions(path: Path) -> dict[str, str]:
+    """The metadata of a record.
+
+    Raises:
+        RecordError: see `Reader`.
+    """
+    try:
+        stream = path.open("rb")
+    except OSError as error:
+        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+    with stream:
+        try:
+            for record in StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records:
+                if isinstance(record, Metadata) and record.name == METADATA:
+                    return _checked(path, dict(record.metadata))
+                if isinstance(record, Chunk):
+                    break
+        except InvalidMagic:
+            raise RecordError(f"{path}: not an MCAP file") from None
+        except (McapError, EndOfFile, OSError, ValueError, ArithmeticError, LookupError):
+            raise RecordError(f"{path}: cut off before its first cycle") from None
+        except Exception as error:  # noqa: BLE001 - struct.error and what else damaged bytes lead to
+            raise RecordError(f"{path}: damaged at its beginning: {error}") from None
+    raise RecordError(f"{path}: an MCAP file, but not a record of arm-companion")
+
+
+def _checked(path: Path, versions: dict[str, str]) -> dict[str, str]:
+    found = versions.get("format")
+    if found != FORMAT:
+        raise RecordError(f"{path}: a record of format {found}, this version reads format {FORMAT}")
+    return versions

@@ -1,0 +1,109 @@
+"""What the daemon tells whoever records it; nothing here ever waits."""
+
+from dataclasses import dataclass
+
+from arm_companion.config.schema import Config
+from arm_companion.mission.facts import Commands, Facts, Notice
+from arm_companion.mission.state import State
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """One cycle: what was known, what was remembered before, and what was asked for."""
+
+    t: float  # loop time, s
+    facts: Facts
+    state: State
+    commands: Commands
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """Bytes that passed over a link or the servo bus at once."""
+
+    t: float  # loop time, s
+    pipe: str  # "mavlink/NAME" or "servos"
+    sent: bool
+    data: bytes
+
+
+class Recorder:
+    """Records nothing; the others override what they keep. All times are the loop's, s."""
+
+    raw = False
+    """Whether frames are wanted."""
+
+    def configure(self, t: float, config: Config) -> None:
+        """This configuration is in force from now on."""
+
+    def mechanics(self, name: str) -> None:
+        """The mechanics run on this, such as "numpy"; told before the first cycle."""
+
+    def put(self, record: Record) -> None:
+        """Take one cycle."""
+
+    def notice(self, t: float, notice: Notice) -> None:
+        """Take one sentence for people."""
+
+    def frame(self, frame: Frame) -> None:
+        """Take raw bytes."""
+
+    def troubles(self) -> list[str]:
+        """What people should know of the recording itself, once each."""
+        return []
+
+    def close(self) -> None:
+        """Write what is left and stop."""
+
+
+class MemoryRecorder(Recorder):
+    """Keeps all cycles, for tests and simulated time."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def put(self, record: Record) -> None:
+        """Keep it."""
+        self.records.append(record)
+
+
+class Both(Recorder):
+    """Hands everything to several recorders."""
+
+    def __init__(self, *recorders: Recorder) -> None:
+        self._recorders = recorders
+        self.raw = any(recorder.raw for recorder in recorders)
+
+    def configure(self, t: float, config: Config) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.configure(t, config)
+
+    def mechanics(self, name: str) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.mechanics(name)
+
+    def put(self, record: Record) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.put(record)
+
+    def notice(self, t: float, notice: Notice) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.notice(t, notice)
+
+    def frame(self, frame: Frame) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.frame(frame)
+
+    def troubles(self) -> list[str]:
+        """See `Recorder`."""
+        return [text for recorder in self._recorders for text in recorder.troubles()]
+
+    def close(self) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.close()

@@ -1,0 +1,311 @@
+"""Recorded facts through today's code, and every command compared bit for bit."""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import orjson
+
+from arm_companion.arm import compiled
+from arm_companion.arm.model import ArmModel
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
+from arm_companion.config.schema import Config
+from arm_companion.config.table import from_table
+from arm_companion.errors import RecordError
+from arm_companion.mission.facts import Facts
+from arm_companion.mission.mission import step
+from arm_companion.mission.situation import Parameters
+from arm_companion.mission.state import State
+from arm_companion.record.reader import Item, Reader
+from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, STATE, transition
+from arm_companion.record_codec import build, plain
+
+Change = Callable[[Config], Config]
+
+_QUANTITIES: Final = {
+    "predicted force": ("N", ("wrench", "force_b")),
+    "predicted torque": ("N m", ("wrench", "torque_b")),
+    "tendon goal": ("m", ("pulls",)),
+    "vehicle set-point": ("m", ("setpoint", "position_w")),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Cycle:
+    """One cycle as recorded; only the facts are needed in any case, so the rest stays text."""
+
+    number: int
+    t: float  # loop time, s
+    facts: Facts
+    state: bytes
+    commands: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where a replay first left the record."""
+
+    cycle: int
+    seconds: float  # since the first cycle
+    field: str
+    recorded: Any
+    now: Any
+
+
+@dataclass(frozen=True, slots=True)
+class Moved:
+    """A change of state."""
+
+    seconds: float
+    before: str
+    after: str
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Greatest:
+    """Greatest difference of a quantity over a flight."""
+
+    value: float
+    unit: str
+    seconds: float
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What a replay found."""
+
+    cycles: int = 0
+    same: int = 0
+    failures: list[tuple[int, str]] = field(default_factory=list)  # cycle, and what today's code raised
+    gaps: list[tuple[int, int]] = field(default_factory=list)  # cycles that are missing: first, how many
+    first: Difference | None = None
+    why: list[str] = field(default_factory=list)
+    remarks: list[str] = field(default_factory=list)
+    recorded: list[Moved] = field(default_factory=list)
+    now: list[Moved] = field(default_factory=list)
+    greatest: dict[str, Greatest] = field(default_factory=dict)
+    seconds: float = 0.0  # of flight
+
+    @property
+    def identical(self) -> bool:
+        """Every command of every cycle is the same, bit for bit."""
+        return self.same == self.cycles
+
+
+def replay(reader: Reader, *, change: Change | None = None, mechanics: str = "") -> Outcome:
+    """Run a record through today's `step`, from the first cycle's memory on.
+
+    The facts stay as they were: after a first difference the world does not answer to the other commands.
+
+    Args:
+        reader: the record.
+        change: makes another configuration of each recorded one.
+        mechanics: "numpy" or "numba" instead of what the record was made with.
+
+    Raises:
+        RecordError: it has no cycle, or facts that this version cannot read.
+        ConfigError: its configuration is not one of this version, or `change` refuses.
+    """
+    outcome = Outcome(why=_reasons(reader.versions))
+    if change is not None:
+        outcome.why.insert(0, "the configuration is another one")
+    wanted = mechanics or reader.versions.get("mechanics", "numpy")
+    runner = _Runner(outcome, change, _mechanics(wanted, reader.versions.get("mechanics", ""), outcome.why))
+    for found in cycles(reader):
+        if isinstance(found, Cycle):
+            runner.take(found)
+        else:
+            runner.configure(found)
+    outcome.remarks += reader.remarks
+    if not outcome.cycles:
+        raise RecordError(f"{reader.path}: {'; '.join([*reader.remarks, 'it has no whole cycle'])}")
+    if outcome.identical:
+        outcome.why.clear()
+    return outcome
+
+
+def cycles(reader: Reader) -> Iterator[Cycle | Config]:
+    """The cycles of a record, and the configurations between them.
+
+    Raises:
+        RecordError: facts are not what this version knows.
+        ConfigError: so is a configuration.
+    """
+    parts: dict[str, Item] = {}
+    for item in reader.messages((FACTS, STATE, COMMANDS, CONFIGURATION)):
+        if item.topic == CONFIGURATION:
+            yield from_table(orjson.loads(item.data)["config"], f"configuration of {reader.path.name}")
+            continue
+        parts[item.topic] = item
+        if item.topic == COMMANDS and FACTS in parts and parts[FACTS].sequence == item.sequence:
+            table = orjson.loads(parts[FACTS].data)
+            try:
+                t = float(table.pop("t"))
+                facts = build(Facts, table)
+            except (KeyError, ValueError) as error:
+                known = reader.versions.get("version", "?")
+                raise RecordError(
+                    f"{reader.path}: cycle {item.sequence} cannot be read, the record is of version {known}: {error}"
+                ) from None
+            yield Cycle(item.sequence, t, facts, parts[STATE].data if STATE in parts else b"", item.data)
+
+
+class _Runner:
+    """Memory and parameters of a replay while it runs."""
+
+    def __init__(self, outcome: Outcome, change: Change | None, fast: bool) -> None:
+        self._outcome = outcome
+        self._change = change
+        self._fast = fast
+        self._parameters: Parameters | None = None
+        self._state: State | None = None
+        self._next = 0
+        self._start = 0.0
+
+    def configure(self, config: Config) -> None:
+        """From here on with this configuration."""
+        if self._change is not None:
+            config = self._change(config)
+        old = self._parameters
+        model: ArmModel
+        if old is not None and old.config.arm == config.arm:
+            model = old.model
+        else:
+            model = RodModel(ArmParameters.of(config.arm), fast=self._fast)
+        self._parameters = Parameters(config, model)
+
+    def take(self, cycle: Cycle) -> None:
+        """Run one cycle and compare."""
+        outcome = self._outcome
+        if self._parameters is None:
+            raise RecordError("the record has no configuration before its first cycle")
+        if self._state is None or cycle.number != self._next:
+            self._resume(cycle)
+        self._next = cycle.number + 1
+        outcome.cycles += 1
+        seconds = outcome.seconds = cycle.t - self._start
+        state = self._state or State()
+        try:
+            self._state, commands = step(state, cycle.facts, cycle.t, self._parameters)
+        except Exception as error:  # noqa: BLE001 - as in the daemon: the cycle fails, the next one comes
+            outcome.failures.append((cycle.number, f"{type(error).__name__}: {error}"))
+            self._note_first(cycle, seconds, "", "commands", f"{type(error).__name__}: {error}")
+            outcome.recorded += _moves(orjson.loads(cycle.commands), seconds)
+            return
+        now = orjson.dumps({"t": cycle.t} | plain(commands))
+        if now == cycle.commands:
+            outcome.same += 1
+            if commands.notices:
+                moves = _moves(plain(commands), seconds)
+                outcome.recorded += moves
+                outcome.now += moves
+            return
+        self._compare(cycle, orjson.loads(cycle.commands), orjson.loads(now), seconds)
+
+    def _resume(self, cycle: Cycle) -> None:
+        """Memory as recorded: at the first cycle, and where some are missing."""
+        if self._state is None:
+            self._start = cycle.t
+            if cycle.number:
+                self._outcome.remarks.append(f"its first {cycle.number} cycles are missing")
+        else:
+            self._outcome.gaps.append((self._next, cycle.number - self._next))
+        try:
+            self._state = build(State, orjson.loads(cycle.state)) if cycle.state else self._state or State()
+        except ValueError as error:
+            raise RecordError(f"cycle {cycle.number}: memory of another version: {error}") from None
+        if cycle.number and self._state.prediction is not None:
+            self._outcome.why.append(
+                "cycles are missing: where the solver starts is not recorded, so last bits may differ after the gap"
+            )
+
+    def _compare(self, cycle: Cycle, recorded: dict[str, Any], now: dict[str, Any], seconds: float) -> None:
+        outcome = self._outcome
+        outcome.recorded += _moves(recorded, seconds)
+        outcome.now += _moves(now, seconds)
+        different = next(differences(recorded, now), None)
+        if different is None:  # only the text differs, as with another version of the writer
+            outcome.same += 1
+            return
+        self._note_first(cycle, seconds, *different)
+        for name, (unit, path) in _QUANTITIES.items():
+            distance = _distance(_at(recorded, path), _at(now, path))
+            if distance > 0.0 and (name not in outcome.greatest or distance > outcome.greatest[name].value):
+                outcome.greatest[name] = Greatest(distance, unit, seconds)
+
+    def _note_first(self, cycle: Cycle, seconds: float, path: str, recorded: Any, now: Any) -> None:
+        if self._outcome.first is None:
+            self._outcome.first = Difference(cycle.number, seconds, path or "commands", recorded, now)
+
+
+def differences(recorded: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Path, recorded value and present value of everything that differs between two JSON values."""
+    if isinstance(recorded, dict) and isinstance(now, dict):
+        for key in [*recorded, *(key for key in now if key not in recorded)]:
+            below = f"{path}.{key}" if path else key
+            yield from differences(recorded.get(key, "(absent)"), now.get(key, "(absent)"), below)
+    elif isinstance(recorded, list) and isinstance(now, list) and len(recorded) == len(now):
+        for i, (a, b) in enumerate(zip(recorded, now, strict=True)):
+            yield from differences(a, b, f"{path}[{i}]")
+    elif recorded != now or _sign(recorded) != _sign(now):
+        yield path, recorded, now
+
+
+def _sign(value: Any) -> float:
+    return math.copysign(1.0, value) if isinstance(value, float) else 0.0
+
+
+def _moves(commands: dict[str, Any], seconds: float) -> list[Moved]:
+    found = (transition(notice["text"]) for notice in commands["notices"])
+    return [Moved(seconds, *change) for change in found if change is not None]
+
+
+def _at(table: Any, path: tuple[str, ...]) -> Any:
+    for key in path:
+        table = table.get(key) if isinstance(table, dict) else None
+    return table
+
+
+def _distance(a: Any, b: Any) -> float:
+    """Euclidean distance of two lists of numbers; 0 where one is absent or not finite."""
+    if not isinstance(a, list) or not isinstance(b, list) or len(a) != len(b):
+        return 0.0
+    if any(isinstance(x, str) for x in (*a, *b)):
+        return 0.0
+    return math.dist(a, b)
+
+
+def _mechanics(wanted: str, recorded: str, why: list[str]) -> bool:
+    """Whether to run compiled mechanics."""
+    fast = wanted == "numba"
+    if fast:
+        try:
+            compiled.load(compiling=False)
+        except compiled.NotCompiled as reason:
+            why.append(f"it flew on compiled mechanics, and here they run on NumPy: {reason}")
+            return False
+    if recorded and recorded != wanted:
+        why.append(f"it flew with mechanics on {recorded}, and this replay asks for {wanted}")
+    return fast
+
+
+def _reasons(versions: dict[str, str]) -> list[str]:
+    """What is different here from where the record was made, as far as it can change bits."""
+    from arm_companion.record.versions import versions as versions_here  # noqa: PLC0415 - reads the processor
+
+    here = versions_here(Config())
+    names = ("version", "python", "numpy", "numba", "machine", "processor")
+    return [
+        f"{name}: recorded with {versions[name]}, now {here.get(name, 'none')}"
+        for name in names
+        if name in versions and versions[name] != here.get(name)
+    ]
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The outcome for `--json`."""
+    return json.loads(orjson.dumps(outcome)) | {"identical": outcome.identical}  # type: ignore[no-any-return]

@@ -1,0 +1,1 @@
+"""One page of a recorded flight, for the evening after."""

@@ -1,0 +1,122 @@
+"""The verdict of a flight in words, from what the daemon knew; in the simulator from the truth as well."""
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from arm_companion.geometry.arrays import Array
+from arm_companion.report.flight import RecordedFlight
+
+_HOT_DEGC: Final = 65.0
+_NEAR: Final = 0.9
+_AT_REST: Final = frozenset({"STARTUP", "STOWED", "READY"})
+_TOUCHING: Final = frozenset({"CONTACT", "WRAP", "VERIFY", "PERCHED", "UNLOAD", "RELEASE"})
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """How it went.
+
+    Attributes:
+        grade: "good", "look" (something to look at) or "bad".
+        headline: one sentence.
+        points: what stands behind it.
+    """
+
+    grade: str
+    headline: str
+    points: tuple[str, ...]
+
+
+def judge(flight: RecordedFlight) -> Verdict:
+    """The verdict."""
+    bad = [f"{said.text} ({said.t:.1f} s)" for said in flight.said if said.level in {"critical", "error"}]
+    if flight.spans and flight.spans[-1].name not in _AT_REST:
+        bad.append(f"the record ends in state {flight.spans[-1].name}")
+    look = [f"{said.text} ({said.t:.1f} s)" for said in flight.said if said.level == "warning"]
+    if flight.faults:
+        look.append(f"error bits in flight: {', '.join(flight.faults)}")
+    if flight.missing:
+        look.append(f"{flight.missing} of {flight.cycles + flight.missing} cycles are missing in the record")
+    look += flight.remarks
+    look += _limits(flight)
+    grade = "bad" if bad else "look" if look else "good"
+    return Verdict(grade, _headline(flight), (*dict.fromkeys([*bad, *look]), *_figures(flight)))
+
+
+def _headline(flight: RecordedFlight) -> str:
+    held = [span.end - span.begin for span in flight.spans if span.name == "PERCHED"]
+    if held:
+        after = [span.name for span in flight.spans[_last(flight, "PERCHED") + 1 :]]
+        let_go = "and let go" if "DEPART" in after else "and did not let go in this record"
+        times = "once" if len(held) == 1 else f"{len(held)} times"
+        return f"Perched {times}, {sum(held):.0f} s in all, {let_go}."
+    tried = [span for span in flight.spans if span.name == "APPROACH"]
+    if not tried:
+        return "No perch was ordered."
+    last = next((span for span in reversed(flight.spans) if span.name in {"UNLOAD", "DEPART", "HOLDING"}), None)
+    return f"Did not perch: {last.cause}." if last else "Did not perch."
+
+
+def _last(flight: RecordedFlight, name: str) -> int:
+    return max(i for i, span in enumerate(flight.spans) if span.name == name)
+
+
+def _limits(flight: RecordedFlight) -> list[str]:
+    found = []
+    hottest = _most(flight.temperature)
+    if hottest > _HOT_DEGC:
+        found.append(f"a servo reached {hottest:.0f} °C")
+    if flight.config is not None:
+        limit = flight.config.limits
+        most = _most(flight.tension)
+        if most > _NEAR * limit.tension_max_n:
+            found.append(f"a tendon reached {most:.1f} N; the limit is {limit.tension_max_n:g} N")
+        force = _most(np.linalg.norm(flight.force_b, axis=1))
+        if force > _NEAR * limit.wrench_force_n:
+            found.append(f"the predicted force reached {force:.1f} N; the limit is {limit.wrench_force_n:g} N")
+    return found
+
+
+def _figures(flight: RecordedFlight) -> list[str]:
+    """Numbers that every flight has."""
+    flying = _where(flight, {span.name for span in flight.spans} - _AT_REST)
+    error = np.linalg.norm(flight.setpoint_w - flight.position_w, axis=1)[flying]
+    figures = [
+        f"greatest tendon tension {_most(flight.tension):.1f} N",
+        f"hottest servo {_most(flight.temperature):.0f} °C, lowest voltage {-_most(-flight.voltage):.1f} V",
+        f"greatest predicted force on the airframe {_most(np.linalg.norm(flight.force_b, axis=1)):.1f} N",
+        f"greatest predicted torque {_most(np.linalg.norm(flight.torque_b, axis=1)):.2f} N m",
+    ]
+    if np.isfinite(error).any():
+        figures.append(f"vehicle off its set-point by {1e3 * float(np.nanmedian(error)):.0f} mm (median)")
+    if flight.truth:
+        for name, states in (("free", {"READY", "APPROACH", "DEPART"}), ("in contact", set(_TOUCHING))):
+            off = force_error(flight)[_where(flight, states)]
+            off = off[np.isfinite(off)]
+            if len(off):
+                rms = math.sqrt(float(np.mean(off**2)))
+                figures.append(f"predicted force against the simulator's truth, {name}: {rms:.2f} N RMS off")
+    return figures
+
+
+def force_error(flight: RecordedFlight) -> Array:
+    """Distance of predicted and true force at each `t` (k,), N; nan where one is not known."""
+    true = np.column_stack([np.interp(flight.t, flight.truth["t"], flight.truth["force_b"][:, i]) for i in range(3)])
+    error: Array = np.linalg.norm(flight.force_b - true, axis=1)
+    return error
+
+
+def _where(flight: RecordedFlight, names: set[str]) -> Array:
+    inside = np.zeros(len(flight.t), dtype=bool)
+    for span in flight.spans:
+        if span.name in names:
+            inside |= (flight.t >= span.begin) & (flight.t < span.end)
+    return inside
+
+
+def _most(values: Array) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.max()) if finite.size else math.nan

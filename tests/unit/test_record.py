@@ -1,0 +1,334 @@
+"""Records on disk: what stands in them, power cuts, slow and full disks, rotation, and what is no record."""
+
+import errno
+import functools
+import itertools
+import json
+import math
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import orjson
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from arm_companion.config import Config, load
+from arm_companion.config.schema import RecordConfig
+from arm_companion.config.table import as_table, from_table
+from arm_companion.errors import ConfigError, RecordError
+from arm_companion.mission.facts import Commands, Notice, Severity, VehicleState
+from arm_companion.mission.state import State
+from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.record import storage
+from arm_companion.record.file_recorder import FileRecorder
+from arm_companion.record.mcap_file import McapFile
+from arm_companion.record.raw import KeyGuard
+from arm_companion.record.reader import Reader
+from arm_companion.record.recorder import Frame, Record
+from arm_companion.record.replay import Cycle, cycles
+from arm_companion.record.topics import COMMANDS, FACTS, LOG, SCHEMAS, TRANSITIONS, transition
+from arm_companion.record.versions import versions
+from arm_companion.record_codec import build, dumps, loads
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "perch.mcap"
+CONFIG = load("sim.toml")
+
+
+@functools.cache
+def records() -> list[Record]:
+    """Cycles of the golden flight."""
+    found = []
+    for cycle in itertools.islice(cycles(Reader(GOLDEN)), 300):
+        if isinstance(cycle, Cycle):
+            table = orjson.loads(cycle.commands)
+            table.pop("t")
+            found.append(Record(cycle.t, cycle.facts, State(t=cycle.t), build(Commands, table)))
+    return found
+
+
+def recorder(
+    path: Path, open_file: Callable[[Path, dict[str, str]], McapFile] = McapFile, **options: object
+) -> FileRecorder:
+    made = FileRecorder(
+        path, RecordConfig(**options), versions(CONFIG), lambda t: 1.7e9 + t, patient=True, open_file=open_file
+    )
+    made.configure(0.0, CONFIG)
+    made.mechanics("numpy")
+    return made
+
+
+def write(path: Path, **options: object) -> None:
+    made = recorder(path, **options)
+    for record in records():
+        made.frame(Frame(record.t, "mavlink/autopilot", True, bytes(1500)))
+        made.notice(record.t, Notice(Severity.INFO, "READY -> APPROACH: order PERCH"))
+        made.put(record)
+    made.close()
+    assert made.troubles() == []
+
+
+def facts(path: Path) -> tuple[int, list[str]]:
+    reader = Reader(path)
+    return len(list(reader.messages((FACTS,)))), reader.remarks
+
+
+@given(st.floats(), st.floats())
+def test_every_float_comes_back_with_every_bit(a: float, b: float) -> None:
+    state = VehicleState(position_w=(a, b, -0.0), heartbeat_age_s=b)
+    text = dumps(state)
+    json.loads(text, parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
+    back = loads(VehicleState, text)
+    for x, y in zip((*back.position_w, back.heartbeat_age_s), (a, b, -0.0, b), strict=True):
+        assert (math.isnan(x) and math.isnan(y)) or (x == y and math.copysign(1, x) == math.copysign(1, y))
+
+
+def test_the_stock_reader_finds_every_channel_with_a_schema_that_fits(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    write(path)
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+        assert summary is not None
+        topics = {channel.topic: channel for channel in summary.channels.values()}
+        assert SCHEMAS.keys() < topics.keys()
+        assert topics["/raw/mavlink/autopilot/sent"].message_encoding == "application/octet-stream"
+        seen = set()
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic.startswith("/raw/"):
+                assert message.data == bytes(1500)
+                continue
+            assert schema is not None
+            assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
+            fits(json.loads(message.data), json.loads(schema.data), channel.topic)
+            seen.add(channel.topic)
+    assert {FACTS, "/state", COMMANDS, LOG, TRANSITIONS, "/configuration"} <= seen
+
+
+def fits(value: object, schema: dict, where: str) -> None:
+    if value is None or value in ("nan", "inf", "-inf"):
+        return
+    kinds = {"object": dict, "array": list, "number": (int, float), "integer": int, "string": str, "boolean": bool}
+    assert isinstance(value, kinds[schema["type"]]), where
+    if isinstance(value, dict) and "properties" in schema and schema["properties"]:
+        assert value.keys() <= schema["properties"].keys(), where
+        for name, item in value.items():
+            fits(item, schema["properties"][name], f"{where}.{name}")
+    if isinstance(value, list):
+        for item in value:
+            fits(item, schema["items"], where)
+
+
+def test_configuration_versions_and_calibration_are_in_it(tmp_path: Path) -> None:
+    directory = tmp_path / "calibration"
+    directory.mkdir()
+    (directory / "tendons.json").write_text('{"version": 1}')
+    config = load("sim.toml", [f'calibration.directory="{directory}"'])
+    made = FileRecorder(tmp_path / "r.mcap", config.record, versions(config), lambda t: t, patient=True)
+    made.configure(0.0, config)
+    made.put(records()[0])
+    made.close()
+    reader = Reader(tmp_path / "r.mcap")
+    assert reader.versions["calibration/tendons.json"] == '{"version": 1}'
+    assert {"version", "python", "numpy", "processor"} <= reader.versions.keys()
+    assert next(c for c in cycles(reader) if isinstance(c, Config)) == config
+
+
+def test_a_configuration_comes_back_and_settings_over_it_are_checked() -> None:
+    table = json.loads(json.dumps(as_table(CONFIG)))
+    assert from_table(table, "x") == CONFIG
+    assert from_table(table, "x", ["perch.grip_tension_n=25"]).perch.grip_tension_n == 25.0
+    with pytest.raises(ConfigError, match="grip_tension_n"):
+        from_table(table, "x", ["perch.grip_tension_n=-1"])
+    with pytest.raises(ConfigError, match="unknown key"):
+        from_table(table | {"nonsense": 1}, "x")
+
+
+def test_a_power_cut_anywhere_leaves_all_that_was_whole(tmp_path: Path) -> None:
+    path, cut = tmp_path / "r.mcap", tmp_path / "cut.mcap"
+    write(path)
+    data = path.read_bytes()
+    whole, remarks = facts(path)
+    assert (whole, remarks) == (len(records()), [])
+    counts = []
+    for share in (0.2, 0.5, 0.8, 0.99):
+        cut.write_bytes(data[: int(share * len(data))])
+        count, remarks = facts(cut)
+        counts.append(count)
+        assert count == whole or "cut off" in remarks[0]
+    assert counts == sorted(counts)
+    assert 0 < counts[1] < whole
+
+
+def test_flipped_bytes_are_noticed_and_what_stands_before_them_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    write(path)
+    data = bytearray(path.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 64] = os.urandom(64)
+    path.write_bytes(data)
+    count, remarks = facts(path)
+    assert 0 < count < len(records())
+    assert "damaged" in remarks[0] or "cut off" in remarks[0]
+
+
+def no_records(tmp_path: Path) -> Iterator[tuple[Path, str]]:
+    yield tmp_path / "absent.mcap", "cannot be read"
+    yield tmp_path, "cannot be read"
+    for name, data, why in (
+        ("empty.mcap", b"", "cut off"),
+        ("text.mcap", b"no record, but a long enough text\n", "not an MCAP file"),
+        ("magic.mcap", b"\x89MCAP0\r\n", "cut off"),
+    ):
+        (tmp_path / name).write_bytes(data)
+        yield tmp_path / name, why
+    with (tmp_path / "foreign.mcap").open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        writer.finish()
+    yield tmp_path / "foreign.mcap", "not a record of arm-companion"
+    McapFile(tmp_path / "future.mcap", {"format": "99"}).close()
+    yield tmp_path / "future.mcap", "format 99"
+
+
+def test_what_is_no_record_is_refused_in_words(tmp_path: Path) -> None:
+    for path, why in no_records(tmp_path):
+        with pytest.raises(RecordError, match=why):
+            Reader(path)
+
+
+def test_a_record_goes_on_in_parts_and_the_oldest_make_room(tmp_path: Path) -> None:
+    path = tmp_path / "20260101-120000.mcap"
+    others = [tmp_path / "20250101-000000.mcap", tmp_path / "notes.mcap"]
+    for other in others:
+        other.write_bytes(bytes(3_000_000))
+        os.utime(other, (1.0, 1.0))
+
+    made = recorder(path, part_mb=1.0, budget_mb=4.0, keep_free_mb=0.0)
+    for i in range(3):
+        for record in records():
+            made.frame(Frame(record.t + i, "servos", False, os.urandom(4000)))
+            made.put(record)
+    made.close()
+    assert made.troubles() == []
+    assert not others[0].exists()
+    assert others[1].exists()
+    parts = sorted(tmp_path.glob("2026*"))
+    assert len(parts) >= 2
+    assert sum(part.stat().st_size for part in parts) < 5.5e6
+    late = Reader(parts[0])
+    assert list(late.messages((FACTS,)))
+    assert any(isinstance(c, Config) for c in cycles(late)), "every part has its configuration"
+
+
+def test_parts_are_read_in_their_order(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    made = recorder(path, part_mb=1.0, raw_kb_per_s=10_000.0)
+    for record in records():
+        made.frame(Frame(record.t, "servos", False, os.urandom(8000)))
+        made.put(record)
+    made.close()
+    assert (tmp_path / "r-002.mcap").exists()
+    sequences = [item.sequence for item in Reader(path).messages((FACTS,))]
+    assert sequences == list(range(len(records())))
+    second = Reader(tmp_path / "r-002.mcap")
+    assert "part 2" in second.remarks[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "after"),
+    [
+        ("20260101-120000.mcap", "20260101-120000-002.mcap"),
+        ("20260101-120000-002.mcap", "20260101-120000-003.mcap"),
+        ("r.mcap", "r-002.mcap"),
+        ("r-009.mcap", "r-010.mcap"),
+    ],
+)
+def test_names_of_parts(name: str, after: str) -> None:
+    assert storage.following(Path(name)) == Path(after)
+
+
+class Held(McapFile):
+    """A disk that hangs until it is told otherwise."""
+
+    go = threading.Event()
+
+    def json(self, topic: str, unix_ns: int, value: dict, sequence: int = 0) -> None:
+        assert self.go.wait(10.0)
+        super().json(topic, unix_ns, value, sequence)
+
+
+def test_a_hanging_disk_costs_records_and_no_time(tmp_path: Path) -> None:
+    Held.go.clear()
+    made = FileRecorder(tmp_path / "r.mcap", RecordConfig(), {"format": "1"}, lambda t: t, open_file=Held)
+    made.configure(0.0, CONFIG)
+    for i in range(1300):
+        made.put(records()[i % len(records())])  # would wait here for ever if it waited at all
+    assert made.dropped >= 290
+    assert made.troubles() == ["record: the disk is too slow, cycles are missing"]
+    Held.go.set()
+    done = threading.Event()
+    for _ in range(200):
+        made.put(records()[0])
+        if any("complete again" in text for text in made.troubles()):
+            break
+        done.wait(0.05)
+    else:
+        pytest.fail("never caught up")
+    made.close()
+    sequences = [item.sequence for item in Reader(tmp_path / "r.mcap").messages((FACTS,))]
+    assert len(sequences) < sequences[-1] + 1, "the gap shows in the numbers"
+
+
+def test_a_full_disk_is_told_and_recording_goes_on_when_there_is_room(tmp_path: Path) -> None:
+    opened = []
+
+    def full_twice(path: Path, about: dict[str, str]) -> McapFile:
+        opened.append(path.name)
+        if len(opened) <= 2:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return McapFile(path, about)
+
+    made = recorder(tmp_path / "r.mcap", open_file=full_twice)
+    for record in records():  # 24 s of flight: tries again each 10 s
+        made.put(record)
+    made.close()
+    assert opened == ["r.mcap", "r-002.mcap", "r-003.mcap"]
+    assert made.dropped > 200
+    kept = [c for c in cycles(Reader(tmp_path / "r-003.mcap")) if isinstance(c, Cycle)]
+    assert len(kept) == len(records()) - made.dropped
+
+
+def test_raw_bytes_are_bounded(tmp_path: Path) -> None:
+    made = recorder(tmp_path / "r.mcap", raw_kb_per_s=1.0)
+    for record in records()[:50]:
+        made.frame(Frame(record.t, "servos", True, bytes(100)))
+        made.put(record)
+    assert made.troubles() == ["record: raw bytes beyond 1 kB/s are left out"]
+    made.close()
+    raw = list(Reader(tmp_path / "r.mcap").messages(("/raw/servos/sent",)))
+    assert 10 <= len(raw) < 50
+
+
+@pytest.mark.parametrize("cut", [0, 1, 7, 9, 12, 40])
+def test_a_signing_key_is_never_written(cut: int) -> None:
+    codec = MavlinkCodec(255, 190)
+    key = bytes(range(32))
+    frame = codec.encode(mav.MAVLink_setup_signing_message(1, 1, key, 1))
+    beat = codec.encode(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    guard = KeyGuard()
+    chunks = [beat, frame[:cut], frame[cut:]]
+    written = b"".join(chunk for i, chunk in enumerate(chunks) if guard.passes(0.001 * i, chunk))
+    assert beat in written
+    assert key[:8] not in written
+    assert guard.passes(1.0, beat)
+
+
+def test_only_states_of_the_machine_make_a_transition() -> None:
+    assert transition("READY -> APPROACH: order PERCH") == ("READY", "APPROACH", "order PERCH")
+    assert transition("READY -> NOWHERE: x") is None
+    assert transition("tendon 1 broken; the arm holds") is None

@@ -1,0 +1,205 @@
+"""Replay of the golden flight, what-if, and the page for people."""
+
+import dataclasses
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import orjson
+import pytest
+
+from arm_companion.__main__ import main
+from arm_companion.config.schema import Config
+from arm_companion.mission import mission
+from arm_companion.record import replay as replay_module
+from arm_companion.record.mcap_file import McapFile
+from arm_companion.record.reader import Reader, truth_beside
+from arm_companion.record.replay import differences, replay
+from arm_companion.record.topics import COMMANDS, FORMAT, LOG, TRANSITIONS, TRUTH, transition
+from arm_companion.record.versions import versions
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "perch.mcap"
+
+
+def copy(target: Path, *, skip: range = range(0), upto: int = 10**9, **about: str) -> None:
+    """The golden flight without some cycles, or only its beginning, or with other metadata."""
+    reader = Reader(GOLDEN)
+    file = McapFile(target, {**reader.versions, **about})
+    for item in reader:
+        if item.sequence not in skip and item.sequence < upto:
+            file.raw(item.topic, item.unix_ns, item.data, item.sequence)
+    file.close()
+
+
+def test_the_golden_flight_commands_what_it_did() -> None:
+    """Bit for bit where it was made; elsewhere linear algebra may round otherwise, and no decision may differ."""
+    reader = Reader(GOLDEN)
+    here = versions(Config())
+    outcome = replay(reader)
+    assert outcome.cycles == 1183
+    assert not outcome.failures
+    assert [m.after for m in outcome.now] == [m.after for m in outcome.recorded]
+    assert "PERCHED" in [m.after for m in outcome.now]
+    if all(here.get(name) == reader.versions[name] for name in ("python", "numpy", "machine", "processor")):
+        assert outcome.identical, outcome.first
+    for name, greatest in outcome.greatest.items():
+        assert greatest.value < 5e-3, name
+
+
+def test_other_code_is_found_in_its_first_cycle(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    copy(path, upto=60)
+    count = 0
+
+    def changed(*arguments: Any) -> Any:
+        nonlocal count
+        state, commands = mission.step(*arguments)
+        count += 1
+        if count == 41:
+            wrench = dataclasses.replace(commands.wrench, residual=-1.0)
+            commands = dataclasses.replace(commands, wrench=wrench)
+        if count == 51:
+            raise ZeroDivisionError("today only")
+        return state, commands
+
+    monkeypatch.setattr(replay_module, "step", changed)
+    outcome = replay(Reader(path))
+    assert outcome.first is not None
+    assert (outcome.first.cycle, outcome.first.field, outcome.first.now) == (40, "wrench.residual", -1.0)
+    assert outcome.failures == [(50, "ZeroDivisionError: today only")]
+    assert outcome.cycles == 60
+
+
+def test_a_gap_is_told_and_replay_goes_on_behind_it(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    copy(path, skip=range(20, 25), upto=40)
+    outcome = replay(Reader(path))
+    assert outcome.gaps == [(20, 5)]
+    assert outcome.cycles == 35
+
+
+def test_what_another_configuration_would_have_done(capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["replay", str(GOLDEN), "--set", "perch.grip_tension_n=28", "--json"])
+    found = json.loads(capsys.readouterr().out)
+    assert code == 3
+    assert found["why"][0] == "the configuration is another one"
+    assert "PERCHED" in [move["after"] for move in found["recorded"]]
+    assert "PERCHED" not in [move["after"] for move in found["now"]]
+    assert any("28 N are needed" in move["cause"] for move in found["now"])
+    assert found["greatest"]["predicted force"]["value"] > 0.1
+    assert found["first"]["seconds"] == pytest.approx(44.0, abs=0.5)
+
+
+def test_exit_codes_and_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.mcap"
+    copy(path, upto=30)
+    code = main(["replay", str(path)])
+    said = capsys.readouterr().out
+    assert code in {0, 3}
+    assert "30 cycles" in said
+    assert ("bit for bit" in said) == (code == 0)
+    assert main(["replay", str(path), "--set", "perch.nonsense=1"]) == 78
+    assert "nonsense" in capsys.readouterr().err
+    assert main(["replay", __file__]) == 1
+    assert "not an MCAP file" in capsys.readouterr().err
+    copy(path, upto=0)
+    assert main(["replay", str(path)]) == 1
+    assert "no whole cycle" in capsys.readouterr().err
+
+
+def test_other_versions_are_named_as_reasons(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    copy(path, upto=5, numpy="1.0", mechanics="numba")
+    outcome = replay(Reader(path), mechanics="numpy")
+    if not outcome.identical:
+        assert any("numpy: recorded with 1.0" in reason for reason in outcome.why)
+        assert any("mechanics" in reason for reason in outcome.why)
+
+
+def test_a_cycle_that_this_version_does_not_know_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.mcap"
+    reader = Reader(GOLDEN)
+    file = McapFile(path, {**reader.versions, "version": "9.9"})
+    for item in reader:
+        if item.sequence > 2:
+            break
+        data = item.data.replace(b'"vehicle"', b'"airframe"') if item.topic == "/facts" else item.data
+        file.raw(item.topic, item.unix_ns, data, item.sequence)
+    file.close()
+    assert main(["replay", str(path)]) == 1
+    assert "version 9.9" in capsys.readouterr().err
+    assert main(["report", str(path)]) == 1
+    assert "version 9.9" in capsys.readouterr().err
+
+
+def test_differences_name_the_field() -> None:
+    found = list(differences({"a": [1.0, 0.0], "b": {"c": "x"}}, {"a": [1.0, -0.0], "b": {"c": "y"}, "d": 1}))
+    assert [path for path, _, _ in found] == ["a[1]", "b.c", "d"]
+
+
+class Page(HTMLParser):
+    """What a browser would load, and the text."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.loads: list[str] = []
+        self.text = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.loads += [value or "" for name, value in attrs if name in {"src", "href"}]
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_report_is_one_page_that_needs_nothing_else(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "flight.mcap"
+    reader = Reader(GOLDEN)
+    file = McapFile(path, reader.versions)
+    start = 0
+    for item in reader:
+        if item.topic == COMMANDS:
+            for notice in orjson.loads(item.data)["notices"]:
+                if (change := transition(notice["text"])) is not None:
+                    table = {"t": item.unix_ns * 1e-9, "after": change[1], "cause": change[2]}
+                    file.json(TRANSITIONS, item.unix_ns, table)
+            start = start or item.unix_ns
+        file.raw(item.topic, item.unix_ns, item.data, item.sequence)
+    warning = "tendon 3 <b>slack</b> & warm"
+    file.json(LOG, start + 10**9, {"level": 3, "message": warning})
+    file.close()
+    truth = McapFile(truth_beside(path), {"format": FORMAT, "content": "truth"})
+    for i in range(1000):
+        values = {"position_w": [0.0] * 3, "force_b": [0.0] * 3, "torque_b": [0.0] * 3, "tension": [4.0] * 4}
+        truth.json(TRUTH, 0, {"t": 0.1 * i, **values, "contact_force_n": 0.0, "wrap_angle": 0.0})
+    truth.close()
+
+    assert main(["report", str(path)]) == 0
+    assert "Perched once" in capsys.readouterr().out
+    text = (tmp_path / "flight" / "report.html").read_text(encoding="utf-8")
+    page = Page(text)
+    assert "script" not in page.tags
+    assert "link" not in page.tags
+    assert page.loads
+    assert all(value.startswith("data:image/png;base64,") for value in page.loads)
+    assert not re.search(r"url\(|@import", text)
+    assert 'name="viewport"' in text
+    assert warning in page.text
+    for word in ("PERCHED", "pull test passed", "against the simulator's truth", "Have a look"):
+        assert word in page.text
+    for name in ("force", "torque", "tensions", "position", "error", "temperature", "links", "servos"):
+        assert (tmp_path / "flight" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_record_that_was_cut_off_still_makes_a_page(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "r.mcap"
+    path.write_bytes(GOLDEN.read_bytes()[:400_000])
+    assert main(["report", str(path), "--json", "--output", str(tmp_path / "page")]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["grade"] == "look"
+    assert any("cut off" in point for point in found["points"])
