@@ -1,11 +1,11 @@
 """Cells of docs/failure_policy.md that the mission never sees: what only serves people never touches flight."""
 
 import dataclasses
+import errno
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from arm_companion.recorder import FileRecorder, Record
 
 from arm_companion.clock import run_simulated
 from arm_companion.config.parameters import PARAMETERS, When
@@ -15,17 +15,24 @@ from arm_companion.mission.failure_policy import SITUATIONS
 from arm_companion.mission.mission import step
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import Phase
+from arm_companion.record.file_recorder import FileRecorder
+from arm_companion.record.mcap_file import McapFile
+from arm_companion.record.recorder import Record
 from tests.unit.mission_rig import BENT, HELD, T0, memory
 from tests.unit.test_daemon_services import config, running
 
 Hovering = Callable[..., Facts]
-FULL = Path("/dev/full")
 
 
-@pytest.mark.skipif(not FULL.exists(), reason="this system has no full disk to write to")
+def full(path: Path, about: dict[str, str]) -> McapFile:
+    raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+
 @pytest.mark.parametrize("situation", SITUATIONS)
-def test_a_full_disk_costs_records_and_nothing_else(situation: str, parameters: Parameters, hovering: Hovering) -> None:
-    recorder = FileRecorder(FULL)
+def test_a_full_disk_costs_records_and_nothing_else(
+    situation: str, parameters: Parameters, hovering: Hovering, tmp_path: Path
+) -> None:
+    recorder = FileRecorder(tmp_path / "r.mcap", parameters.config.record, {}, lambda t: t, open_file=full)
     for phase in SITUATIONS[situation]:
         facts = hovering(BENT if phase in HELD else (0.0, 0.0))
         state, commands = step(memory(phase), facts, T0 + 0.01, parameters)
