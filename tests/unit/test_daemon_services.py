@@ -122,3 +122,20 @@ def test_a_key_that_cannot_be_used_is_a_configuration_error(tmp_path: Path) -> N
                 pass
 
     run_simulated(main())
+
+
+def test_the_feedforward_is_switched_over_mavlink(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with running(config(tmp_path)) as (daemon, _, ground, _recorder, _task):
+            ground.send(GCS)
+            for value, result, on in (
+                (0.0, mav.MAV_RESULT_ACCEPTED, False),
+                (2.0, mav.MAV_RESULT_DENIED, False),
+                (1.0, mav.MAV_RESULT_ACCEPTED, True),
+            ):
+                ground.command(mav.MAV_CMD_ARM_FEEDFORWARD, value)
+                await asyncio.sleep(0.3)
+                assert ground.all("COMMAND_ACK")[-1].result == result
+                assert daemon._state.feedforward is on
+
+    run_simulated(main())

@@ -172,6 +172,13 @@ def test_stale_vehicle_state_freezes_the_reference(parameters: Parameters, hover
     assert said[-1].setpoint is not None
 
 
+def test_a_frozen_reference_asks_for_no_speed(parameters: Parameters, hovering: Hovering) -> None:
+    for phase in (Phase.APPROACH, Phase.RELEASE):
+        before = dataclasses.replace(at(phase, anchor=ANCHOR), reference=Reference((2.0, 0.0, -2.2), (0.5, 0.0, 0.0)))
+        _, said = run(before, hovering(position_age_s=2.0), parameters, 0.1)
+        assert all(c.setpoint is not None and c.setpoint.velocity_w == (0.0, 0.0, 0.0) for c in said)
+
+
 def test_a_silent_servo_ends_the_approach_and_is_told(parameters: Parameters, hovering: Hovering) -> None:
     facts = hovering()
     dead = dataclasses.replace(facts.tendons[2], silent=True)

@@ -22,12 +22,12 @@ from arm_companion.mission.facts import (
     SetpointKind,
     VehicleState,
 )
-from arm_companion.mission.machine import OrderRow, Transition
 from arm_companion.mission.perch import TABLE
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.record_codec import dumps, loads
 from tests.unit.mission_rig import DT, Run, memory
+from tests.unit.test_perch_table import reachable
 
 Hovering = Callable[..., Facts]
 
@@ -161,30 +161,11 @@ def test_nothing_that_can_be_seen_or_ordered_makes_an_exception_or_an_illegal_co
 FLYING = [phase for phase in Phase if phase in MOVES_VEHICLE]
 
 
-def _rows() -> list[Transition[Phase, Situation] | OrderRow[Phase, Situation]]:
-    return [*TABLE.transitions, *TABLE.orders]
-
-
-def _reachable(start: Phase) -> set[Phase]:
-    seen, todo = {start}, [start]
-    while todo:
-        here = todo.pop()
-        for row in _rows():
-            if here in row.sources and row.target not in seen:
-                seen.add(row.target)
-                todo.append(row.target)
-    return seen
-
-
-def test_every_phase_can_be_reached() -> None:
-    assert _reachable(Phase.STARTUP) == set(Phase)
-
-
 @pytest.mark.parametrize("phase", FLYING, ids=lambda phase: phase.name)
 def test_every_live_phase_can_abort_and_the_abort_ends_at_rest_or_holding(phase: Phase) -> None:
     row = TABLE.order(Order.ABORT, phase)
     assert row is not None
-    assert {Phase.STOWED, Phase.HOLDING} & _reachable(row.target)
+    assert {Phase.STOWED, Phase.HOLDING} & reachable(row.target)
     if row.target is phase:  # being given up already: it ends by itself
         assert any(phase in row.sources and row.target is not phase for row in TABLE.transitions)
 
