@@ -115,7 +115,7 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
     names = tuple(kinds)
     get = operator.attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
-    others = [(name, write) for name, hint in kinds.items() if hint is not float and (write := _writer(hint)) != _same]
+    others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _writer(hint)) != _same]
     last: tuple[Any, Any] = (None, None)
 
     def table_of(value: Any) -> Any:

@@ -37,10 +37,10 @@ def configured_recorder(config: Config, clock: Clock) -> Recorder:
     else:
         start = datetime.fromtimestamp(clock.unix(clock.now()), UTC)
         path = Path(config.record.directory) / f"{start:%Y%m%d-%H%M%S}.mcap"
-    return file_recorder(path, config, clock)
+    return open_recorder(path, config, clock)
 
 
-def file_recorder(path: Path, config: Config, clock: Clock, *, patient: bool = False) -> Recorder:
+def open_recorder(path: Path, config: Config, clock: Clock, *, patient: bool = False) -> Recorder:
     """A recorder of the daemon in this file.
 
     Raises:

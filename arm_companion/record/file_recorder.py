@@ -40,6 +40,8 @@ _SYNC_S: Final = 2.0
 _RETRY_S: Final = 10.0
 _RAW_S: Final = 1.0
 _BREATH_S: Final = 0.001
+_GATHER_S: Final = 0.025
+_FEW: Final = 10
 _MB: Final = 1_000_000
 
 
@@ -194,10 +196,21 @@ class FileRecorder(Recorder):
                 self.dropped += 1
             if batch.last:
                 break
-            # with a backlog this thread would compete with the cycle for the interpreter
-            if not self._patient and not self._queue.empty():
-                self._breath.wait(_BREATH_S)
+            if not self._patient:
+                self._rest()
         self._finish()
+
+    def _rest(self) -> None:
+        """Leave the interpreter to the cycle.
+
+        To wake up costs as much as to write a cycle, so a few are gathered; few, because the cycle waits for the
+        lock while they are encoded. With a long backlog every one is followed by a pause.
+        """
+        waiting = self._queue.qsize()
+        if waiting == 0:
+            self._breath.wait(_GATHER_S)
+        elif waiting > _FEW:
+            self._breath.wait(_BREATH_S)
 
     def _take(self, batch: _Batch) -> None:
         if batch.configs:

@@ -70,6 +70,10 @@ def _limits(flight: RecordedFlight) -> list[str]:
     if hottest > _HOT_DEGC:
         found.append(f"a servo reached {hottest:.0f} °C")
     if flight.config is not None:
+        wanted = flight.config.rates.cycle_hz
+        rate = (flight.cycles + flight.missing) / max(flight.seconds, 1e-9)
+        if flight.seconds > 1.0 and rate < _NEAR * wanted:
+            found.append(f"the daemon ran {rate:.0f} cycles a second, {wanted:g} are configured: too slow a machine")
         limit = flight.config.limits
         most = _most(flight.tension)
         if most > _NEAR * limit.tension_max_n:

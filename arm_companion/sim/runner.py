@@ -17,7 +17,7 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock
 from arm_companion.config.schema import Config
 from arm_companion.errors import ArmError
-from arm_companion.record import file_recorder
+from arm_companion.record import open_recorder
 from arm_companion.record.recorder import Both, MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
@@ -70,7 +70,7 @@ async def fly_simulated(
     prepare(plant)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
     memory = MemoryRecorder()
-    recorder = memory if log is None else Both(memory, file_recorder(log, config, clock, patient=True))
+    recorder = memory if log is None else Both(memory, open_recorder(log, config, clock, patient=True))
     openers = Openers(
         {
             name: companion.opener(1) if link.role == "autopilot" else arm.opener(0)

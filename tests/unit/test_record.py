@@ -1,5 +1,6 @@
 """Records on disk: what stands in them, power cuts, slow and full disks, rotation, and what is no record."""
 
+import asyncio
 import errno
 import functools
 import itertools
@@ -17,6 +18,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from arm_companion.clock import Clock
 from arm_companion.config import Config, load
 from arm_companion.config.schema import RecordConfig
 from arm_companion.config.table import as_table, from_table
@@ -25,12 +27,12 @@ from arm_companion.mission.facts import Commands, Notice, Severity, VehicleState
 from arm_companion.mission.state import State
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec
-from arm_companion.record import storage
+from arm_companion.record import configured_recorder, storage
 from arm_companion.record.file_recorder import FileRecorder
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.raw import KeyGuard
 from arm_companion.record.reader import Reader
-from arm_companion.record.recorder import Frame, Record
+from arm_companion.record.recorder import Frame, Record, Recorder
 from arm_companion.record.replay import Cycle, cycles
 from arm_companion.record.topics import COMMANDS, FACTS, LOG, SCHEMAS, TRANSITIONS, transition
 from arm_companion.record.versions import versions
@@ -332,3 +334,15 @@ def test_only_states_of_the_machine_make_a_transition() -> None:
     assert transition("READY -> APPROACH: order PERCH") == ("READY", "APPROACH", "order PERCH")
     assert transition("READY -> NOWHERE: x") is None
     assert transition("tendon 1 broken; the arm holds") is None
+
+
+def test_a_daemon_that_should_record_and_cannot_says_so_at_its_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = load("sim.toml", ['record.directory="x"'])
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    clock = Clock(asyncio.new_event_loop(), 0.0)
+    try:
+        with pytest.raises(ConfigError, match=r"arm-companion\[record\]"):
+            configured_recorder(config, clock)
+        assert type(configured_recorder(CONFIG, clock)) is Recorder, "none is asked for"
+    finally:
+        clock._loop.close()
