@@ -17,6 +17,7 @@ _COMMANDS = {
     "servos": "find, set up and watch the servos",
     "jog": "bend the arm from the keyboard, while no daemon runs",
     "config": "check or show a configuration",
+    "doctor": "look at the whole installation, and say what to mend",
 }
 
 
