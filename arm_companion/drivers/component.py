@@ -86,6 +86,8 @@ class Component:
         mavlink = MavlinkConfig() if mavlink is None else mavlink
         limits = LimitsConfig() if limits is None else limits
         self.counters = ComponentCounters()
+        self.hearers: list[Callable[[Notice], None]] = []
+        """Who else is told what everybody on MAVLink is told."""
         self.status = SystemStatus.BOOT
         """What the heartbeat says of us."""
         self._links = links
@@ -148,6 +150,8 @@ class Component:
     def notify(self, notice: Notice) -> None:
         """Tell everybody."""
         self._speaker.say(notice)
+        for hear in self.hearers:
+            hear(notice)
 
     async def run(self) -> None:
         """Send heartbeats, the first at once, until cancelled."""

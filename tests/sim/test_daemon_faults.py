@@ -28,7 +28,11 @@ def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest
         world.at(6.0, lambda w: w.autopilot.fail())
 
     fed: list[ServiceManager] = []
-    monkeypatch.setattr(ServiceManager, "alive", lambda manager: fed.append(manager))
+
+    def feed(manager: ServiceManager) -> None:
+        fed.append(manager)
+
+    monkeypatch.setattr(ServiceManager, "alive", feed)
     monkeypatch.setattr(app, "step", sometimes)
     result = run_simulated(fly_simulated(config, lambda _: None, end_soon))
     assert result.cycles - len(result.records) == 30, "failed cycles are not recorded, all others are"
