@@ -1,6 +1,5 @@
 """Checks of the configuration beyond single values: what `run` would refuse, and what it takes but should not."""
 
-import stat
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -10,6 +9,7 @@ from arm_companion.config.schema import Config
 from arm_companion.doctor.check import Check, Outcome, fail, ok, warn
 from arm_companion.doctor.machine_checks import no_config
 from arm_companion.doctor.subject import Subject
+from arm_companion.drivers.mqtt_publisher import check_files
 from arm_companion.drivers.signing_keys import read_key
 from arm_companion.errors import ConfigError
 
@@ -57,18 +57,10 @@ def _keys(config: Config) -> Iterator[Outcome]:
             read_key(Path(link.signing_key))
         except ConfigError as error:
             yield fail(f"link {name}: {error}", "mend the file of the key")
-    for key in ("password_file", "key_file"):
-        path = getattr(getattr(config, "mqtt", None), key, "")
-        if path and (wrong := _exposed(Path(path))):
-            yield fail(f"mqtt.{key} {path}: {wrong}", f"chmod 600 {path}")
-
-
-def _exposed(path: Path) -> str:
     try:
-        mode = path.stat().st_mode
-    except OSError as error:
-        return error.strerror or "cannot be read"
-    return f"others may read it (mode {stat.S_IMODE(mode):04o})" if mode & stat.S_IRWXO else ""
+        check_files(config.mqtt)
+    except ConfigError as error:
+        yield fail(str(error), "mend the file that it names")
 
 
 CHECKS: Final = (

@@ -263,7 +263,8 @@ async def main() -> None:
 
 
 if __name__ == "__main__":
-    resource.setrlimit(resource.RLIMIT_DATA, (_MOST_MEMORY, _MOST_MEMORY))
+    with contextlib.suppress(OSError, ValueError):  # the unit's system calls may lack it
+        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_MEMORY, _MOST_MEMORY))
     with contextlib.suppress(OSError):
         os.nice(5)
     asyncio.run(main())

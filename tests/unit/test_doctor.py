@@ -18,7 +18,7 @@ from arm_companion.__main__ import main
 from arm_companion.arm.compiled import NotCompiled
 from arm_companion.cli import doctor as command
 from arm_companion.config import Config
-from arm_companion.config.schema import CalibrationConfig, LinkConfig, RecordConfig
+from arm_companion.config.schema import CalibrationConfig, LinkConfig, MqttConfig, RecordConfig
 from arm_companion.doctor import report
 from arm_companion.doctor.check import Check, Finding, Level, Outcome, examine, ok, warn
 from arm_companion.doctor.redaction import HIDDEN, redact
@@ -142,6 +142,8 @@ def test_where_nothing_is_wrong_every_check_is_well_and_has_its_reason(subject: 
             "autopilot": LinkConfig("nonsense", "autopilot")})}, Level.FAIL, "nonsense"),
         ("configuration", {"config": dataclasses.replace(CONFIG, links={
             "autopilot": dataclasses.replace(AUTOPILOT, signing_key="/nowhere/key")})}, Level.FAIL, "/nowhere/key"),
+        ("configuration", {"config": dataclasses.replace(CONFIG, mqtt=MqttConfig(
+            host="x", user_file="/nowhere/user"))}, Level.FAIL, "/nowhere/user"),
         ("configuration", {"config": None, "config_error": "arm.toml: mass_kg = -1"}, Level.FAIL, "mass_kg = -1"),
     ],
 )  # fmt: skip
