@@ -19,6 +19,7 @@ _COMMANDS = {
     "replay": "run a recorded flight through today's code, or ask what would have been",
     "report": "one page of a recorded flight, for people",
     "config": "check or show a configuration",
+    "doctor": "look at the whole installation, and say what to mend",
 }
 
 

@@ -19,6 +19,8 @@ from arm_companion.drivers.component import Component
 from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
+from arm_companion.drivers.mqtt_payloads import Health
+from arm_companion.drivers.mqtt_publisher import MqttPublisher
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.settings import Settings, state_directory
@@ -123,12 +125,16 @@ class Daemon:
             settings=self._settings,
             on_power=self._end,
         )
-        self._component.on_notice = lambda notice: self._recorder.notice(clock.now(), notice)
+        self._component.hearers.append(lambda notice: self._recorder.notice(clock.now(), notice))
         self.vehicle_check = VehicleCheck(
             autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
         )
         self._telemetry = Telemetry(self._links, config.rates, clock)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
+        self._mqtt = MqttPublisher(config.mqtt, clock, self._component.commands) if config.mqtt.host else None
+        if self._mqtt is not None:
+            self._component.hearers.append(self._mqtt.event)
+        self._started = clock.now()
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
         self._bus = ServoBus(
             openers.servos,
@@ -167,6 +173,7 @@ class Daemon:
                 self._component.run,
                 self._keys.run,
                 self._bus.run,
+                *(() if self._mqtt is None else (self._mqtt.run,)),
                 self._cycles,
             )
         finally:
@@ -328,6 +335,12 @@ class Daemon:
             stiffness=commands.stiffness,
             payload=commands.payload,
         )
+        if self._mqtt is not None:
+            self._mqtt.publish(now, facts, commands, self._health)
+
+    def _health(self) -> Health:
+        links = {link.name: link.connected for link in self._links}
+        return Health(self._clock.now() - self._started, self.cycles, self.missed, self.failures, links)
 
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""

@@ -1,8 +1,10 @@
-"""The daemon's life: readiness and watchdog for systemd, stop on SIGTERM, everything under one TaskGroup."""
+"""The daemon's life: priority, readiness and watchdog for systemd, stop on SIGTERM, all under one TaskGroup."""
 
 import asyncio
+import ctypes
 import logging
 import os
+import resource
 import signal
 import socket
 from collections.abc import Awaitable, Callable
@@ -48,6 +50,42 @@ class ServiceManager:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+_PRIORITY = 20  # below the kernel's interrupt threads, 50
+_MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
+
+
+def take_priority() -> list[str]:
+    """Real-time priority for the calling thread, and memory that stays, as far as the limits of this process allow.
+
+    RLIMIT_RTPRIO and RLIMIT_MEMLOCK, which the systemd unit sets, decide; at a shell nothing is taken. Threads that
+    are started later have the usual priority: writing a record is not urgent.
+
+    Returns:
+        What was taken, and what was allowed and failed all the same, in words for the log.
+    """
+    words = []
+    priority = min(_PRIORITY, _limit(resource.RLIMIT_RTPRIO))
+    if priority > 0:
+        try:
+            os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+            words.append(f"real-time priority {priority}")
+        except OSError as error:
+            words.append(f"no real-time priority: {error.strerror}")
+    if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] == resource.RLIM_INFINITY:
+        # with a limit that is not infinite, a later allocation would fail that would otherwise not
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT) == 0:
+            words.append("memory locked")
+        else:
+            words.append(f"memory not locked: {os.strerror(ctypes.get_errno())}")
+    return words
+
+
+def _limit(which: int) -> int:
+    soft = resource.getrlimit(which)[0]
+    return 99 if soft == resource.RLIM_INFINITY else soft
 
 
 def stop_on_signals(stop: asyncio.Event) -> Callable[[], None]:

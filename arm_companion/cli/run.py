@@ -10,7 +10,9 @@ from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
 from arm_companion.drivers.settings import with_kept_changes
 from arm_companion.drivers.standard_services import Power
-from arm_companion.supervisor import ServiceManager, stop_on_signals
+from arm_companion.supervisor import ServiceManager, stop_on_signals, take_priority
+
+log = logging.getLogger(__name__)
 
 START_AGAIN = 75
 """Exit code after PREFLIGHT_REBOOT_SHUTDOWN asked for a restart; systemd takes it for a failure and starts anew."""
@@ -30,6 +32,9 @@ def run(arguments: argparse.Namespace) -> int:
         stream=sys.stderr,
     )
     config = with_kept_changes(load_from(arguments))
+
+    for words in take_priority():
+        log.info("%s", words)
 
     async def main() -> int:
         stop = asyncio.Event()

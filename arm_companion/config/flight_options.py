@@ -83,7 +83,7 @@ class PerchConfig:
     )
     slide_force_n: float = option(
         "most that a vertical move pushes against a wrap, which slides on its bar rather than stretch; 0 does not push",
-        2.5,
+        1.5,
         unit="N",
         lower=0.0,
         upper=50.0,

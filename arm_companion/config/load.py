@@ -33,6 +33,24 @@ def load(file: str | Path, settings: Iterable[str] = ()) -> Config:
     return read(Config, table, source)
 
 
+def files_of(file: str | Path) -> list[Path]:
+    """A configuration file and those that it extends, as far as they can be found.
+
+    Raises:
+        ConfigError: there is no such file.
+    """
+    found: list[Path] = []
+    path: Path | None = locate(file)
+    while path is not None and path not in found:
+        found.append(path)
+        try:
+            base = tomllib.loads(path.read_text(encoding="utf-8")).get(_EXTENDS)
+            path = locate(path.parent / base) if isinstance(base, str) else None
+        except (ConfigError, OSError, ValueError):  # TOML and UTF-8 errors are ValueErrors
+            path = None
+    return found
+
+
 def locate(file: str | Path) -> Path:
     """The file itself, or the shipped one of that name.
 

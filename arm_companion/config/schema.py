@@ -24,6 +24,7 @@ from arm_companion.config.flight_options import (
     SimConfig,
 )
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
+from arm_companion.config.mqtt_options import MqttConfig
 from arm_companion.config.options import section
 from arm_companion.config.servo_options import CalibrationConfig, ServosConfig
 from arm_companion.errors import ConfigError
@@ -40,6 +41,7 @@ __all__ = [
     "LinkConfig",
     "MavlinkConfig",
     "MountConfig",
+    "MqttConfig",
     "PerchConfig",
     "RatesConfig",
     "RecordConfig",
@@ -66,6 +68,7 @@ class Config:
     perch: PerchConfig = section(PerchConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
+    mqtt: MqttConfig = section(MqttConfig)
     sim: SimConfig = section(SimConfig)
 
     def __post_init__(self) -> None:

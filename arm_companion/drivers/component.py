@@ -86,8 +86,8 @@ class Component:
         mavlink = MavlinkConfig() if mavlink is None else mavlink
         limits = LimitsConfig() if limits is None else limits
         self.counters = ComponentCounters()
-        self.on_notice: Callable[[Notice], None] = lambda _: None
-        """Told of every sentence for everybody."""
+        self.hearers: list[Callable[[Notice], None]] = []
+        """Who else is told what everybody on MAVLink is told."""
         self.status = SystemStatus.BOOT
         """What the heartbeat says of us."""
         self._links = links
@@ -149,8 +149,9 @@ class Component:
 
     def notify(self, notice: Notice) -> None:
         """Tell everybody."""
-        self.on_notice(notice)
         self._speaker.say(notice)
+        for hear in self.hearers:
+            hear(notice)
 
     async def run(self) -> None:
         """Send heartbeats, the first at once, until cancelled."""

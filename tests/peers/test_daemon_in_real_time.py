@@ -196,6 +196,48 @@ def test_the_first_heartbeat_comes_soon_even_with_nothing_connected(tmp_path: Pa
             assert "stopping in STARTUP" in process.stderr.read()
 
 
+def words_until(notify: socket.socket, quiet_s: float) -> list[bytes]:
+    """What the service manager hears until it hears nothing for so long."""
+    notify.settimeout(quiet_s)
+    heard = []
+    with contextlib.suppress(TimeoutError):
+        while True:
+            heard += [notify.recv(64)]
+    return heard
+
+
+def test_a_daemon_that_stands_still_stops_feeding_the_watchdog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:
+        notify.bind(str(tmp_path / "notify"))
+        notify.settimeout(15.0)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        with daemon(
+            f"links.ground.url=udpout:127.0.0.1:{free_port()}",
+            f"links.autopilot.url=udpin:127.0.0.1:{free_port()}",
+            f"servos.port={tmp_path / 'nothing'}",
+        ) as process:
+            assert notify.recv(64) == b"READY=1"
+            assert [notify.recv(64) for _ in range(20)] == [b"WATCHDOG=1"] * 20
+            process.send_signal(signal.SIGSTOP)
+            until = time.monotonic() + 10.0
+            while Path(f"/proc/{process.pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+                assert time.monotonic() < until, "it does not stop"
+                time.sleep(0.01)
+            notify.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while True:  # what it sent before it stopped
+                    notify.recv(64)
+            notify.settimeout(2.5)  # the unit's WatchdogSec is 2
+            with pytest.raises(TimeoutError):
+                notify.recv(64)
+            process.send_signal(signal.SIGCONT)
+            notify.settimeout(10.0)
+            assert notify.recv(64) == b"WATCHDOG=1"
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(timeout=10.0) == 0
+            assert words_until(notify, 0.2)[-1] == b"STOPPING=1"
+
+
 def test_a_bad_configuration_ends_with_code_78_and_says_what_is_allowed() -> None:
     with daemon("perch.bar_radius_m=9") as process:
         assert process.wait(timeout=10.0) == 78

@@ -9,6 +9,7 @@ from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.world import World
+from arm_companion.supervisor import ServiceManager
 
 
 @pytest.mark.scenario
@@ -27,9 +28,16 @@ def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest
     def end_soon(world: World) -> None:
         world.at(6.0, lambda w: w.autopilot.fail())
 
+    fed: list[ServiceManager] = []
+
+    def feed(manager: ServiceManager) -> None:
+        fed.append(manager)
+
+    monkeypatch.setattr(ServiceManager, "alive", feed)
     monkeypatch.setattr(app, "step", sometimes)
     result = run_simulated(fly_simulated(config, lambda _: None, end_soon))
     assert result.cycles - len(result.records) == 30, "failed cycles are not recorded, all others are"
+    assert len(fed) == len(result.records), "only a cycle that completed feeds the watchdog"
     assert any("cycle failed" in text and "hold" in text for _, text in result.flight.texts)
     before, after = result.records[298], result.records[299]
     assert after.t - before.t > 0.25, "the cycle goes on after the failure"

@@ -1,0 +1,1 @@
+"""`arm-companion doctor`: looks at an installation as it stands, and says what to mend. Nothing is changed."""
