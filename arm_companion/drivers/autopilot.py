@@ -39,6 +39,9 @@ _ENOUGH: Final = 0.5
 _GIVE_UP: Final = 5
 """Checks in a row after which a stream counts as one that the autopilot does not give."""
 
+_ESTIMATOR_S: Final = 60.0
+"""So long an autopilot may take until its estimator has a position to send; ArduPilot takes some 42 s."""
+
 _SURE_S: Final = 0.02
 """A state's own time stamp is believed when the clocks are known to agree this well."""
 
@@ -192,7 +195,8 @@ class Autopilot:
         self._slow[id_] = self._slow[id_] + 1 if slow else 0
         name = mav.mavlink_map[id_].msgname
         self.slow_streams.pop(name, None)
-        if self._slow[id_] >= _GIVE_UP:
+        patience = _ESTIMATOR_S / CHECK_PERIOD_S if id_ == POSITION and got == 0.0 else _GIVE_UP
+        if self._slow[id_] >= patience:
             self.slow_streams[name] = (asked, got)
 
     def _request(self, id_: int, rate_hz: float) -> None:

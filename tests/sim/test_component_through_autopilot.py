@@ -275,6 +275,16 @@ def test_what_is_set_up_wrong_is_told_once_with_its_mend_and_again_after_a_reboo
     through(body, flavour, prepare)
 
 
+@BOTH
+def test_an_estimator_is_given_the_time_that_it_needs(flavour: str) -> None:
+    async def body(rig: Rig) -> None:
+        await asyncio.sleep(50.0)  # no position comes for the first 8 or 42 s
+        assert "LOCAL_POSITION_NED" not in rig.words()
+        assert not rig.autopilot.slow_streams
+
+    through(body, flavour, lambda stand_in: setattr(stand_in, "_ready_s", 42.0))
+
+
 def test_a_stream_that_stays_slow_is_told() -> None:
     def prepare(stand_in: AutopilotStandIn) -> None:
         stand_in._flavour = dataclasses.replace(stand_in._flavour, least_period_s=0.1)
