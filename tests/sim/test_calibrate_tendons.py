@@ -99,9 +99,12 @@ class Bench:
         while True:
             await asyncio.sleep(0.004)
             now = loop.time()
-            wound = [d * (p - z) * M_PER_TICK for d, p, z in zip(signs, self.servos.positions(), zeros, strict=True)]
-            self.servos.advance(now - last, (self.loads(np.array(wound)) * 0.01).tolist())
-            last = now
+            while last < now:  # in small steps even where the machine was late: tendons are stiff
+                dt = min(now - last, 0.004)
+                horns = zip(signs, self.servos.positions(), zeros, strict=True)
+                wound = [d * (p - z) * M_PER_TICK for d, p, z in horns]
+                self.servos.advance(dt, (self.loads(np.array(wound)) * 0.01).tolist())
+                last += dt
 
     @contextlib.asynccontextmanager
     async def open(self) -> AsyncIterator["Bench"]:
