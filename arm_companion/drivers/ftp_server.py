@@ -1,6 +1,7 @@
 """A read-only MAVLink FTP server for a few files in memory: our component's metadata."""
 
 import asyncio
+import dataclasses
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -17,6 +18,9 @@ log = logging.getLogger(__name__)
 
 PACE_S: Final = 0.01
 """From one packet of a burst to the next: an autopilot between us and the reader drops what comes faster."""
+
+BURST_S: Final = 1.5
+"""A burst ends after so long; the client asks for the next one."""
 
 MOST_SESSIONS: Final = 8
 _MOST_CLIENTS: Final = 32
@@ -99,7 +103,7 @@ class FtpServer:
         if (burst := self._bursts.pop(client, None)) is not None:
             burst.cancel()
         if request.opcode == Opcode.BURST_READ_FILE:
-            self._burst(client, request, request.sequence)
+            self._burst(client, request, request.sequence, asyncio.get_running_loop().time() + BURST_S)
         else:
             self._send(client, self._answer(client, request, self._execute))
 
@@ -117,7 +121,12 @@ class FtpServer:
             self.counters.refused += 1
             reason = bytes((refused.failure,))
             return FtpPayload(
-                request.sequence + 1 & 0xFFFF, Opcode.NAK, request.session, data=reason, answers=request.opcode
+                request.sequence + 1 & 0xFFFF,
+                Opcode.NAK,
+                request.session,
+                request.offset,
+                reason,
+                answers=request.opcode,
             )
         return FtpPayload(
             request.sequence + 1 & 0xFFFF, Opcode.ACK, session, request.offset, data, answers=request.opcode
@@ -187,19 +196,24 @@ class FtpServer:
             data += entry
         return data
 
-    def _burst(self, client: _Client, request: FtpPayload, sequence: int) -> None:
-        """Send one packet of the rest of a file, and come again until its end, which a NAK marks."""
+    def _burst(self, client: _Client, request: FtpPayload, sequence: int, until: float) -> None:
+        """Send one packet of the rest of a file, and come again until its end, which a NAK marks, or `until`.
+
+        Clients take a burst that goes on for long for a server that hears them no more: pymavlink's after 3.7 s.
+        """
         self._bursts.pop(client, None)
-        later = partial(self._burst, client, request, sequence)
+        loop = asyncio.get_running_loop()
+        later = partial(self._burst, client, request, sequence, until)
         if client[0].waiting < _MOST_WAITING:
             asked = FtpPayload(sequence, request.opcode, request.session, request.offset, size=request.size)
             answer = self._answer(client, asked, lambda c, r: (r.session, self._read(c, r)))
-            self._send(client, answer)
-            if answer.opcode == Opcode.NAK or not client[0].connected:
+            over = answer.opcode != Opcode.NAK and loop.time() >= until
+            self._send(client, dataclasses.replace(answer, burst_complete=over))
+            if over or answer.opcode == Opcode.NAK or not client[0].connected:
                 return
             ahead = FtpPayload(0, request.opcode, request.session, request.offset + len(answer.data), size=request.size)
-            later = partial(self._burst, client, ahead, answer.sequence)
-        self._bursts[client] = asyncio.get_running_loop().call_later(PACE_S, later)
+            later = partial(self._burst, client, ahead, answer.sequence, until)
+        self._bursts[client] = loop.call_later(PACE_S, later)
 
     def _send(self, client: _Client, answer: FtpPayload) -> None:
         link, system, component = client

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 
 from arm_companion.drivers.component_metadata import metadata_files
-from arm_companion.drivers.ftp_server import MOST_SESSIONS
+from arm_companion.drivers.ftp_server import BURST_S, MOST_SESSIONS
 from arm_companion.errors import ProtocolError
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.ftp import DATA, PAYLOAD, Failure, FtpPayload, Opcode, crc32, unpack
@@ -54,17 +54,30 @@ def test_a_file_is_read_piece_by_piece() -> None:
     serve(body)
 
 
-def test_a_burst_sends_all_of_it_paced() -> None:
+def test_bursts_send_all_of_it_paced() -> None:
     async def body(rig: ServiceRig) -> None:
         opened = await open_file(rig.ground)
-        request = FtpPayload(10, Opcode.BURST_READ_FILE, opened.session, size=DATA)
+        request = FtpPayload(10, Opcode.BURST_READ_FILE, opened.session, size=DATA // 4)
         first = await ask(rig.ground, request, wait=0.035)
         assert len(first) <= 4
-        await asyncio.sleep(3.0)
+        await asyncio.sleep(2.0 * BURST_S)
+        got, bursts = b"", 1
         answers = [unpack(bytes(m.payload)) for m in rig.ground.all("FILE_TRANSFER_PROTOCOL")][1:]
-        assert [a.sequence for a in answers] == list(range(11, 11 + len(answers)))
-        assert b"".join(a.data for a in answers[:-1]) == CONTENT
-        assert (answers[-1].opcode, answers[-1].data[0]) == (Opcode.NAK, Failure.END_OF_FILE)
+        while True:
+            assert [a.sequence for a in answers] == list(
+                range(request.sequence + 1, request.sequence + 1 + len(answers))
+            )
+            got += b"".join(a.data for a in answers if a.opcode == Opcode.ACK)
+            assert [a.burst_complete for a in answers[:-1]] == [False] * (len(answers) - 1)
+            if answers[-1].opcode == Opcode.NAK:
+                break
+            assert answers[-1].burst_complete, "a burst that stops before the end of the file says so"
+            request = FtpPayload(answers[-1].sequence + 1, request.opcode, opened.session, len(got), size=DATA // 4)
+            answers = await ask(rig.ground, request, wait=2.0 * BURST_S)
+            bursts += 1
+        assert bursts > 1
+        assert got == CONTENT
+        assert (answers[-1].data[0], answers[-1].offset) == (Failure.END_OF_FILE, len(CONTENT))
 
     serve(body)
 
