@@ -146,7 +146,11 @@ def test_bytes_that_are_no_messages_are_survived_on_both_links(world: World) -> 
 def test_a_stock_ground_station_flies_a_perch_and_lets_go(world: World) -> None:
     station = world.station
     station.hear(AUTOPILOT, "HEARTBEAT", 5.0)
-    assert station.command(ARM, READY, timeout=20.0) == ACCEPTED
+    station.hear(ARM, "HEARTBEAT", 10.0)  # who commands before that is not heard
+    until = time.monotonic() + 20.0
+    while station.command(ARM, READY, timeout=20.0) != ACCEPTED:
+        assert time.monotonic() < until, "the arm does not find itself stowed"
+        time.sleep(0.5)
     until = time.monotonic() + 40.0
     while station.command(AUTOPILOT, 400, 1.0) != ACCEPTED:
         assert time.monotonic() < until, "the vehicle does not arm"
