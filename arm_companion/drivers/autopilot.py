@@ -87,7 +87,7 @@ class Autopilot:
             LANDED: LANDED_RATE_HZ,
         }
         self._arrived = dict.fromkeys(self._rates, 0)
-        self._slow = dict.fromkeys(self._rates, 0)  # checks in a row at which too little had come
+        self._slow = dict.fromkeys(self._rates, (False, 0))  # nothing came, and checks in a row that it was so little
         self.slow_streams: dict[str, tuple[float, float]] = {}
         """Messages that stay too slow however often they are asked for: rate asked for and rate measured, Hz."""
         self._refused: set[int] = set()
@@ -192,11 +192,14 @@ class Autopilot:
             since = loop.time()
 
     def _judge(self, id_: int, asked: float, got: float, *, slow: bool) -> None:
-        self._slow[id_] = self._slow[id_] + 1 if slow else 0
+        """Count checks in a row of one kind: a stream that has just begun is not yet slow for having been silent."""
+        silent = got == 0.0
+        was_silent, checks = self._slow[id_]
+        self._slow[id_] = (silent, checks + 1 if silent is was_silent else 1) if slow else (silent, 0)
         name = mav.mavlink_map[id_].msgname
         self.slow_streams.pop(name, None)
-        patience = _ESTIMATOR_S / CHECK_PERIOD_S if id_ == POSITION and got == 0.0 else _GIVE_UP
-        if self._slow[id_] >= patience:
+        patience = _ESTIMATOR_S / CHECK_PERIOD_S if id_ == POSITION and silent else _GIVE_UP
+        if self._slow[id_][1] >= patience:
             self.slow_streams[name] = (asked, got)
 
     def _request(self, id_: int, rate_hz: float) -> None:

@@ -43,6 +43,18 @@ def memory(phase: Phase, **fields: object) -> State:
     return State(phase=phase, **{**known, **fields})  # type: ignore[arg-type]
 
 
+def run(state: State, facts: Facts, parameters: Parameters, seconds: float = DT) -> tuple[State, list[Commands]]:
+    """Let `seconds` pass with the same facts; requests count once."""
+    said = []
+    t = state.t or T0
+    for _ in range(max(round(seconds / DT), 1)):
+        t += DT
+        state, commands = step(state, facts, t, parameters)
+        said.append(commands)
+        facts = dataclasses.replace(facts, requests=())
+    return state, said
+
+
 @dataclass
 class Run:
     """A mission that steps, and everything that it said."""

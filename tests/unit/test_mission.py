@@ -21,27 +21,14 @@ from arm_companion.mission.facts import (
     WrenchReport,
     WrenchSource,
 )
-from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Anchor, Phase, Prediction, Running, State
+from arm_companion.mission.state import Phase, Prediction, Running, State
 from arm_companion.mission.wrench import grip
 from arm_companion.record_codec import dumps, loads
+from tests.unit.mission_rig import ANCHOR, DT, run
 
-DT = 0.01
 Hovering = Callable[..., Facts]
-
-
-def run(state: State, facts: Facts, parameters: Parameters, seconds: float = DT) -> tuple[State, list[Commands]]:
-    """Let `seconds` pass with the same facts; requests count once."""
-    said = []
-    t = state.t or 100.0
-    for _ in range(max(round(seconds / DT), 1)):
-        t += DT
-        state, commands = step(state, facts, t, parameters)
-        said.append(commands)
-        facts = dataclasses.replace(facts, requests=())
-    return state, said
 
 
 def answers(said: list[Commands]) -> list[Answer]:
@@ -55,9 +42,6 @@ def ask(facts: Facts, order: Order, *values: float) -> Facts:
 def at(phase: Phase, **memory: object) -> State:
     fields = {"t": 100.0, "since": 99.0, "control": Control.EXTERNAL, "streaming": True, **memory}
     return State(phase=phase, reference=Reference((2.0, 0.0, -2.2)), **fields)  # type: ignore[arg-type]
-
-
-ANCHOR = Anchor((2.0, 0.0, -2.2), (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 
 
 def test_an_arm_found_straight_is_stowed_and_moves_nothing(parameters: Parameters, hovering: Hovering) -> None:

@@ -6,25 +6,13 @@ from collections.abc import Callable
 
 import pytest
 
-from arm_companion.mission.facts import ArmSetpoint, Commands, Facts, Order, Request, Result, SetpointKind
-from arm_companion.mission.mission import step
+from arm_companion.mission.facts import ArmSetpoint, Facts, Order, Request, Result, SetpointKind
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import Phase, State
+from tests.unit.mission_rig import run
 
-DT = 0.01
 Hovering = Callable[..., Facts]
 NOWHERE = (math.nan, math.nan, math.nan)
-
-
-def run(state: State, facts: Facts, parameters: Parameters, seconds: float = DT) -> tuple[State, list[Commands]]:
-    said = []
-    t = state.t or 100.0
-    for _ in range(max(round(seconds / DT), 1)):
-        t += DT
-        state, commands = step(state, facts, t, parameters)
-        said.append(commands)
-        facts = dataclasses.replace(facts, requests=())
-    return state, said
 
 
 def streaming(facts: Facts, theta: float, delta: float = 0.0) -> Facts:
