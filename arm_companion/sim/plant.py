@@ -186,6 +186,7 @@ class Plant:
             tension=tension,
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
             body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
+            arm_strike=bool(np.any(~outside & np.any(bodies == self._airframe, axis=1))),
         )
 
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:

@@ -4,7 +4,7 @@ It sees what a ground station sees; the plant's truth is for the verdict alone.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from arm_companion.config.schema import Config
@@ -17,6 +17,7 @@ Say = Callable[[str], None]
 _PULL_M = 0.010
 _HOLD_S = 3.0
 _PULL_S = 4.0
+_HANG_S = 15.0
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -73,13 +74,19 @@ class Operator:
 
     async def fly_perch(self) -> str:
         """The whole flight. Returns why it failed, or an empty string."""
+        return await self._fly(self._perch, self._pull, self._release)
+
+    async def fly_hang(self) -> str:
+        """The same with a hang perch: the vehicle hangs for a while, takes its load back and leaves."""
+        return await self._fly(self._hang, self._release)
+
+    async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
         failure = ""
         try:
             await self._prepare()
             await self._take_off()
-            await self._perch()
-            await self._pull()
-            await self._release()
+            for act in acts:
+                await act()
         except (ScenarioFailed, TimeoutError) as error:
             failure = str(error) or "the operator waited too long"
             self._say(f"failed: {failure}")
@@ -123,6 +130,15 @@ class Operator:
         self._say("PERCH")
         await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
 
+    async def _hang(self) -> None:
+        self._say("PERCH, to hang")
+        await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 180.0, float(mav.ARM_PERCH_KIND_HANG))
+        start = asyncio.get_running_loop().time()
+        await asyncio.sleep(_HANG_S)
+        self._flight.marks.append(Mark("hang", start, asyncio.get_running_loop().time(), (0.0, 0.0, 0.0)))
+        if self._state() != "HANGING":
+            raise ScenarioFailed(f"the hanging ended by itself in {self._state()}")
+
     async def _pull(self) -> None:
         """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, then x without compensation."""
         await asyncio.sleep(2.0)
@@ -147,16 +163,16 @@ class Operator:
 
     async def _release(self) -> None:
         self._say("RELEASE")
-        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 90.0)
+        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
 
     async def _come_home(self) -> None:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
-        quiet = ("STOWED", "READY", "HOLDING", "")
-        await self._wait(lambda: self._state() in quiet, 90.0, f"the arm stays in {self._state()}")
-        if self._state() == "HOLDING":
-            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 60.0)
+        quiet = ("STOWED", "READY", "HOLDING", "HANGING", "HANG_HOLD", "")
+        await self._wait(lambda: self._state() in quiet, 150.0, f"the arm stays in {self._state()}")
+        if self._state() in ("HOLDING", "HANGING", "HANG_HOLD"):
+            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
         if self._state() == "READY":
             await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
         self._say("landing")
@@ -165,8 +181,8 @@ class Operator:
 
     # --- small things ---
 
-    async def _order(self, command: int, name: str, timeout_s: float) -> None:
-        result = await self._link.command(command, [0.0] * 7, target=self._arm, timeout=timeout_s)
+    async def _order(self, command: int, name: str, timeout_s: float, first: float = 0.0) -> None:
+        result = await self._link.command(command, [first, *[0.0] * 6], target=self._arm, timeout=timeout_s)
         if result != mav.MAV_RESULT_ACCEPTED:
             raise ScenarioFailed(f"{name}: {self._why(result)}")
 
