@@ -46,6 +46,7 @@ class Plant:
         self._bar = model.body(mjcf.BAR).id
         self._tip = model.site(mjcf.TIP).id
         self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
+        self._rotors = np.array([model.geom(mjcf.rotor(i)).id for i in range(4)])
         # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
         self._link_of_geom = np.full(model.ngeom, -1)
         for i in range(config.arm.disks + 1):
@@ -186,7 +187,7 @@ class Plant:
             tension=tension,
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
             body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
-            arm_strike=bool(np.any(~outside & np.any(bodies == self._airframe, axis=1))),
+            rotor_contact=bool(np.any(np.isin(data.contact.geom, self._rotors))),
         )
 
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:

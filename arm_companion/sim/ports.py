@@ -40,4 +40,4 @@ class PlantTruth:
     tension: tuple[float, ...]  # N, true tendon tensions
     tip_position_w: Vec3  # m
     body_contact: bool  # the airframe itself touches bar or ground
-    arm_strike: bool = False  # the arm touches the airframe, propellers included
+    rotor_contact: bool = False  # something, the arm too, reaches into a propeller's disk

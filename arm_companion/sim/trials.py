@@ -29,7 +29,7 @@ _BAR_ERROR_M = 0.01  # by how much what it is told is wrong, each axis
 _BAR_ERROR_DEG = 2.0
 _WIND_M_PER_S = 2.0
 _CONFIDENCE = 0.95
-_HARM = ("airframe", "did not land", "the hanging vehicle")
+_HARM = ("airframe", "propeller", "did not land", "the hanging vehicle")
 _OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
 
 
