@@ -15,7 +15,8 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
-from arm_companion.mission.load import CARRYING
+from arm_companion.mission.hung_wrench import hung_wrench
+from arm_companion.mission.load import CARRYING, SHARING
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
@@ -176,7 +177,8 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     if holding:
         found = _weigh(found, s, solution)
     # how the bar pushes on an arm that touches but does not hold is not known
-    return _report(found, source, valid=source is not WrenchSource.CONTACT)
+    report = _report(found, source, valid=source is not WrenchSource.CONTACT)
+    return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
 
 
 def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
