@@ -159,9 +159,12 @@ def hung_reference(s: Situation, before: Reference) -> Reference:
     if state.phase is not Phase.TAKE_BACK or state.load.share < 1.0:
         return Reference(state.position, ZERO, before.yaw)
     x, y, _ = state.load.place if state.anchor is None else s.rest
+    top = state.load.first - _LIFT_M
+    if before.position[2] < top:  # it has just left what it thought was the ground
+        before = Reference(state.position, ZERO, before.yaw)
     return follow(
         before,
-        (x, y, state.load.first - _LIFT_M),
+        (x, y, top),
         before.yaw,
         speed=s.config.hang.lift_m_per_s,
         acceleration=_CLIMB_M_PER_S2,

@@ -182,7 +182,8 @@ def _airframe(config: Config, stand: float) -> str:
     ]
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
         lines.append(
-            f'<geom name="{rotor(i)}" type="cylinder" size="{_ROTOR_RADIUS} 0.005" pos="{sx * x} {sy * y} {z}" {solid}/>'
+            f'<geom name="{rotor(i)}" type="cylinder" size="{_ROTOR_RADIUS} 0.005" '
+            f'pos="{sx * x} {sy * y} {z}" {solid}/>'
         )
         # The skids fold up in flight, as on camera drones: they meet the ground and nothing else.
         fx, fy = sx * _FOOT_OFFSET[0], sy * _FOOT_OFFSET[1]

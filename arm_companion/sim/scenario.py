@@ -18,6 +18,9 @@ _PULL_M = 0.010
 _HOLD_S = 3.0
 _PULL_S = 4.0
 _HANG_S = 15.0
+_STANDS_S = 8.0
+_STREAM_S = 1.5
+_FORCE = 21196.0  # param2 of a disarming that asks for no landing
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -80,6 +83,10 @@ class Operator:
         """The same with a hang perch: the vehicle hangs for a while, takes its load back and leaves."""
         return await self._fly(self._hang, self._release)
 
+    async def fly_hang_disarmed(self) -> str:
+        """A person disarms the hanging vehicle, arms it again, gives it back and has it leave."""
+        return await self._fly(self._hang, self._disarm_and_arm, self._release)
+
     async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
         failure = ""
         try:
@@ -111,8 +118,9 @@ class Operator:
         if self._ardupilot:
             # it takes off by command in GUIDED only, PX4 in any mode but OFFBOARD; and it tells only what is asked
             await self._take_external_control()
-            position = [float(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED), 100_000.0]
-            await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, position, "position messages")
+            for message in (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE):
+                asked = [float(message), 100_000.0]
+                await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, asked, "state messages")
         await self._vehicle(
             mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"
         )
@@ -138,6 +146,21 @@ class Operator:
         self._flight.marks.append(Mark("hang", start, asyncio.get_running_loop().time(), (0.0, 0.0, 0.0)))
         if self._state() != "HANGING":
             raise ScenarioFailed(f"the hanging ended by itself in {self._state()}")
+
+    async def _disarm_and_arm(self) -> None:
+        self._say("disarmed by force")
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [0.0, _FORCE], "disarming")
+        await self._wait(lambda: self._state() == "HANG_HOLD", 5.0, "the arm does not notice that the motors stand")
+        await asyncio.sleep(_STANDS_S)
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming")
+        await self._order(mav.MAV_CMD_ARM_READY, "READY", 5.0)
+        if self._ardupilot:  # it ignores set-points until it has been told to take off
+            await self._take_external_control()
+            await self._vehicle(mav.MAV_CMD_NAV_TAKEOFF, [0.0] * 6 + [self._height() + 0.3], "take-off")
+            await self._wait(lambda: not self._landed(), 5.0, "the autopilot does not take off")
+        else:
+            await asyncio.sleep(_STREAM_S)
+            await self._take_external_control()
 
     async def _pull(self) -> None:
         """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, then x without compensation."""
@@ -236,6 +259,10 @@ class Operator:
     def _height(self) -> float:
         position = self._link.latest("LOCAL_POSITION_NED", self._autopilot)
         return -position.z if position is not None else 0.0
+
+    def _landed(self) -> bool:
+        state = self._link.latest("EXTENDED_SYS_STATE", self._autopilot)
+        return state is not None and state.landed_state == mav.MAV_LANDED_STATE_ON_GROUND
 
     def _heartbeat(self) -> Any:
         return self._link.latest("HEARTBEAT", self._autopilot)

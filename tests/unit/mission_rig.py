@@ -80,6 +80,7 @@ class Run:
         if self.state.phase is not self.phases[-1]:
             self.phases.append(self.state.phase)
         self._check(before, facts, commands)
+        check_load(before, self.state, facts, commands)
         return commands
 
     def cycles(self, facts: Facts, seconds: float) -> None:
@@ -117,22 +118,26 @@ class Run:
         assert (commands.pulls is not None) == (commands.arm is ArmAction.DRIVE)
         if state.phase in {Phase.STARTUP, Phase.STOWED, Phase.HOLDING}:
             assert commands.arm is ArmAction.HOLD, "nothing moves until told"
-        if state.phase in CARRYING:
-            assert commands.arm is ArmAction.HOLD, "an arm that may carry the vehicle does not move"
-        if before.phase in CARRYING and state.phase not in CARRYING:
-            assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
-            assert before.phase is Phase.TAKE_BACK
         if commands.pulls is not None:
             assert all(math.isfinite(pull) and abs(pull) <= limits.pull_max_m for pull in commands.pulls)
             assert math.hypot(*state.bend) <= limits.bend_max_rad + 1e-9 or math.hypot(*before.bend) >= math.hypot(
                 *state.bend
             )
-        if state.phase is before.phase and state.pulls and before.pulls:
+        if state.since == before.since and state.pulls and before.pulls:
             turned = math.hypot(state.bend[0] - before.bend[0], state.bend[1] - before.bend[1])
             assert turned <= perch.bend_speed_rad_per_s * 0.1 + 1e-9
         assert not commands.recover or state.phase in {Phase.STARTUP, Phase.STOWED}
         answered = [answer.request for answer in commands.answers]
         assert {request.id for request in facts.requests} <= set(answered), "every order is answered in its cycle"
+
+
+def check_load(before: State, state: State, facts: Facts, commands: Commands) -> None:
+    """An arm that may carry the vehicle does not move, and never opens over stopped motors."""
+    if state.phase in CARRYING:
+        assert commands.arm is ArmAction.HOLD, "an arm that may carry the vehicle does not move"
+    if before.phase in CARRYING and state.phase not in CARRYING:
+        assert before.phase is Phase.TAKE_BACK
+        assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
 
 
 def ask(facts: Facts, order: Order, *values: float, request: int = 7) -> Facts:
