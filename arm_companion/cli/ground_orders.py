@@ -132,6 +132,9 @@ def _order(name: str) -> Action:
             return await follow(arguments, arm, "ABORT", arm.abort(timeout=arguments.timeout))
         if name == "perch" and arguments.bar is not None:
             await _target(arguments, arm)
+        if name == "perch" and arguments.hang:
+            hang = arm.perch(mav.ARM_PERCH_KIND_HANG, progress=progress, timeout=arguments.timeout)
+            return await follow(arguments, arm, "PERCH", hang)
         method: Callable[..., Awaitable[None]] = getattr(arm, name)
         return await follow(arguments, arm, name.upper(), method(progress=progress, timeout=arguments.timeout))
 
