@@ -20,6 +20,7 @@ from arm_companion.ground.jog import HELP, PERIOD_S, WATCHDOG_S, Jog, keyboard
 from arm_companion.ground.parameters import Parameter
 from arm_companion.ground.reports import Status
 from arm_companion.ground.texts import Text
+from arm_companion.protocol.dialect import mav
 
 _TARGET_S: Final = 1.5
 _FOLLOWS_S: Final = 2.0
