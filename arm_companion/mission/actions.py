@@ -46,7 +46,8 @@ _ORDER_OF_PERCH = (
     Phase.PERCHED,
 )
 _ORDER_OF_HANG = (*_ORDER_OF_PERCH[:-1], Phase.LOAD_TRANSFER, Phase.HANGING)
-_ORDER_OF_RELEASE = (Phase.TAKE_BACK, Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
+_ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
+_ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
@@ -175,8 +176,9 @@ def setpoint(s: Situation) -> Setpoint | None:
 
 def progress(s: Situation) -> int:
     """Per cent of the running order, from the phases passed."""
-    there = _ORDER_OF_HANG if s.state.kind is PerchKind.HANG else _ORDER_OF_PERCH
-    for order in (there, _ORDER_OF_RELEASE):
+    hangs = s.state.kind is PerchKind.HANG
+    there, back = (_ORDER_OF_HANG, _ORDER_OF_LEAVING) if hangs else (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
+    for order in (there, back):
         if s.state.phase in order:
             return round(100 * order.index(s.state.phase) / (len(order) - 1))
     return 100 if s.state.phase is Phase.READY else 0

@@ -21,7 +21,7 @@ PX4, ARDUPILOT = mav.MAV_AUTOPILOT_PX4, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
 OFFBOARD = 6 << 16
 GUIDED = 4
 SETPOINT = Setpoint((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.5, 0.6, 0.7), 1.5)
-STREAMS = {31: 100.0, 32: 100.0, 245: 5.0}
+STREAMS = {31: 100.0, 32: 100.0, 245: 5.0, 74: 10.0}
 Peer = Any
 
 
@@ -59,6 +59,8 @@ class Rig:
                 self.position(1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
             if i % 20 == 0:
                 self.peer.send(mav.MAVLink_extended_sys_state_message(0, mav.MAV_LANDED_STATE_IN_AIR))
+            if i % 10 == 0:
+                self.peer.send(mav.MAVLink_vfr_hud_message(0.0, 0.0, 0, 47, 0.0, 0.0))
             if heartbeat and i % 100 == 0:
                 self.peer.heartbeat(PX4, OFFBOARD)
             await asyncio.sleep(0.01)
