@@ -113,6 +113,7 @@ def test_state_is_what_the_messages_say_and_ages_with_the_loop(fly: Callable[...
         rig.attitude(0.8, 0.0, 0.0, 0.6)
         rig.position(1.0, 2.0, -3.0, 0.1, 0.2, 0.3)
         rig.peer.send(mav.MAVLink_extended_sys_state_message(0, mav.MAV_LANDED_STATE_IN_AIR))
+        rig.peer.send(mav.MAVLink_vfr_hud_message(0.0, 0.0, 0, 47, 0.0, 0.0))
         await asyncio.sleep(0.1002)
         state = rig.state
         assert state.attitude_wb == pytest.approx((0.8, 0.0, 0.0, 0.6))
@@ -120,6 +121,7 @@ def test_state_is_what_the_messages_say_and_ages_with_the_loop(fly: Callable[...
         assert state.position_w == pytest.approx((1.0, 2.0, -3.0))
         assert state.velocity_w == pytest.approx((0.1, 0.2, 0.3))
         assert (state.armed, state.landed, state.control, state.mode) == (True, False, Control.EXTERNAL, "OFFBOARD")
+        assert (state.throttle, state.throttle_age_s < 0.11) == (0.47, True)
         ages = (state.heartbeat_age_s, state.position_age_s, state.attitude_age_s)
         assert ages == pytest.approx((0.1, 0.1, 0.1), abs=1e-6)
 
