@@ -250,7 +250,7 @@ def _beside_bar(s: Situation) -> Vec3:
     share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
     closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
-        closed = state.anchor.position_w
+        closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
     # forward first, while the curl is still wide
     ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / _FORWARD_SHARE, 0.0))
     return add(add(s.state.contact_w, scale(sub(closed, s.state.contact_w), share)), ahead)

@@ -31,6 +31,7 @@ _LIFT_M = 0.10  # over where it hung, beyond which the set-point does not rise
 _ROSE_M = 0.04  # a vehicle that rose by so much hangs no more, whatever its throttle
 _OFF_THE_GROUND_M = 0.3  # an autopilot that thinks it has landed takes off to a set-point so high
 _CLIMB_M_PER_S2 = 0.6
+_BELOW_GRIP_M = 0.02  # a closing wrap draws the arm's mount up beside the bar: it is opened from so much lower
 
 
 # --- what is known of the load ---
@@ -99,7 +100,8 @@ def begin(s: Situation) -> State:
     match state.phase:
         case Phase.LOAD_TRANSFER:
             load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0, place=position, first=position[2])
-            return dataclasses.replace(state, load=_next_step(s, load, -1.0), rest=s.probe)
+            rest = add(s.probe, (0.0, 0.0, _BELOW_GRIP_M))
+            return dataclasses.replace(state, load=_next_step(s, load, -1.0), rest=rest)
         case Phase.TAKE_BACK:
             load = dataclasses.replace(fresh, place=position, first=position[2])
             return dataclasses.replace(state, load=_next_step(s, load, 1.0))
