@@ -71,9 +71,9 @@ def _draw_position(axis: Axes, flight: Flight, config: Config, start: float) -> 
 
 
 def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
-    axis.set_ylabel("move while\nperched, mm")
-    hold = next((mark for mark in flight.marks if mark.name == "hold"), None)
-    perched = [(a, b) for name, a, b in flight.spans() if name == "PERCHED"]
+    axis.set_ylabel("move while\nheld, mm")
+    hold = next((mark for mark in flight.marks if mark.name in ("hold", "hang")), None)
+    perched = [(a, b) for name, a, b in flight.spans() if name in ("PERCHED", "HANGING")]
     if hold is None or not perched:
         axis.text(0.5, 0.5, "never perched", transform=axis.transAxes, ha="center", color=_INK)
         return
