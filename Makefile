@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup demo test scenarios soak check bench deb format clean
+.PHONY: help setup demo test scenarios soak check bench docs deb format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -42,6 +42,10 @@ check: $(STAMP)  ## lint, format, types and dependency directions
 
 bench: $(STAMP)  ## measure speed as ratios beside peers; writes build/bench.json
 	@$(BIN)/python -m tests.bench
+
+docs: $(STAMP)  ## build the documentation in build/docs, and check its links
+	@$(BIN)/python -m sphinx -b html -q -W --keep-going docs build/docs
+	@echo "build/docs/index.html"
 
 deb:  ## build a Debian package of the daemon for this machine, in build
 	@systemd/deb.sh --output build
