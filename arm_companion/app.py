@@ -16,6 +16,7 @@ from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
@@ -102,6 +103,7 @@ class Daemon:
         *,
         compiled_model: bool = False,
         model: ArmModel | None = None,
+        computer: ComputerWatch | None = None,
     ) -> None:
         check_flyable(config)
         self._config = config
@@ -138,7 +140,8 @@ class Daemon:
         self.vehicle_check = VehicleCheck(
             autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
         )
-        self._telemetry = Telemetry(self._links, config.rates, clock)
+        self._computer = computer
+        self._telemetry = Telemetry(self._links, config.rates, clock, computer.message if computer else None)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
         self._mqtt = MqttPublisher(config.mqtt, clock, self._component.commands) if config.mqtt.host else None
         if self._mqtt is not None:
@@ -183,6 +186,7 @@ class Daemon:
                 self._keys.run,
                 self._bus.run,
                 *(() if self._mqtt is None else (self._mqtt.run,)),
+                *(() if self._computer is None else (self._computer.run,)),
                 self._cycles,
             )
         finally:

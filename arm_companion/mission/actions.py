@@ -8,7 +8,6 @@ import numpy as np
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
-from arm_companion.mission.load import CARRYING, SHARING, begin, hung_reference, share_on, unloading
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
@@ -22,11 +21,12 @@ from arm_companion.mission.motion import (
     sub,
     yaw_of,
 )
+from arm_companion.mission.sharing import SHARING, SUSPENDED, begin, hung_reference, share_on, unloading
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
 
-_PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | CARRYING
+_PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | SUSPENDED
 _REFERENCE_RESTS = frozenset(
     {
         Phase.READYING,
@@ -65,7 +65,7 @@ _TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that 
 
 def prepare(s: Situation) -> State:
     """Memory at the entry of the present phase."""
-    return begin(s) if s.state.phase in CARRYING else _prepare(s)
+    return begin(s) if s.state.phase in SUSPENDED else _prepare(s)
 
 
 def _prepare(s: Situation) -> State:
@@ -115,7 +115,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     Returns:
         Memory, what the servos do, and their goals (m of tendon taken in) when they are driven.
     """
-    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s), load=share_on(s)))
+    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s), sharing=share_on(s)))
     state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None

@@ -5,7 +5,7 @@ through TAKE_BACK, which ends by the throttle, and what cannot be taken back is 
 """
 
 from arm_companion.arm.reaction import GRAVITY
-from arm_companion.mission import load
+from arm_companion.mission import sharing
 from arm_companion.mission.facts import ArmFault, Control, Order
 from arm_companion.mission.hazards import (
     disarmed,
@@ -31,7 +31,7 @@ Ask = OrderRow[Phase, Situation]
 HUNG = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING})
 """Phases in which the arm carries more and more of the vehicle, or all that it shall."""
 
-_SHARING = load.SHARING
+_SHARING = sharing.SHARING
 _STOWED_ONLY = frozenset({Phase.STOWED})
 _IDLE_MARGIN = 0.2  # of hover thrust, by which the motors may idle higher than asked
 
@@ -49,22 +49,22 @@ def slips(s: Situation) -> str | None:
     hang, sinking = s.config.hang, s.facts.vehicle.velocity_w[2]
     if sinking > hang.fall_m_per_s:
         return f"slip: sinks with {sinking:.2f} m/s"
-    if (slid := load.slid(s)) > hang.slip_m:
+    if (slid := sharing.slid(s)) > hang.slip_m:
         return f"slip: moved {slid:.2f} m"
-    if s.state.phase is Phase.LOAD_TRANSFER and (sunk := load.sunk(s)) > hang.give_m:
+    if s.state.phase is Phase.LOAD_TRANSFER and (sunk := sharing.sunk(s)) > hang.give_m:
         return f"slip: sank {sunk:.2f} m under its load"
     return None
 
 
 def throttle_lost(s: Situation) -> str | None:
     """The autopilot does not tell what its motors do: nobody knows how the load is shared."""
-    return None if load.motor_share(s) is not None else "the motors' throttle is not known"
+    return None if sharing.motor_share(s) is not None else "the motors' throttle is not known"
 
 
 def hangs(s: Situation) -> str | None:
     """The last step down has been made, the motors idle, and the vehicle rests."""
-    hang, share = s.config.hang, load.motor_share(s)
-    now = s.state.load
+    hang, share = s.config.hang, sharing.motor_share(s)
+    now = s.state.sharing
     if share is None or now.share > hang.idle_share or now.rested_s < hang.rest_s:
         return None
     return f"hangs, motors at {share:.0%} of hover" if share <= hang.idle_share + _IDLE_MARGIN else None
@@ -72,9 +72,9 @@ def hangs(s: Situation) -> str | None:
 
 def motors_carry(s: Situation) -> str | None:
     """The motors carry the vehicle again, so that the arm may let go."""
-    if not load.carried(s):
+    if not sharing.carried(s):
         return None
-    share = load.motor_share(s)
+    share = sharing.motor_share(s)
     return "the vehicle rose off the arm" if share is None else f"motors carry {share:.0%} of the hover's thrust"
 
 
@@ -99,7 +99,7 @@ def cannot_hang(s: Situation) -> str | None:
     weight, limit = s.config.vehicle.mass_kg * GRAVITY, s.config.limits.wrench_force_n
     if weight > limit:
         return f"the vehicle's weight, {weight:.1f} N, is over limits.wrench_force_n = {limit:g}"
-    if not load.throttle_known(s):
+    if not sharing.throttle_known(s):
         return "the autopilot does not tell its throttle (VFR_HUD)"
     return None
 

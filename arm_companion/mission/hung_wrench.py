@@ -5,8 +5,8 @@ import math
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import WrenchReport, WrenchSource
-from arm_companion.mission.load import motor_share
 from arm_companion.mission.motion import ZERO, unrotate
+from arm_companion.mission.sharing import motor_share
 from arm_companion.mission.situation import Situation
 
 _THRUST_SPREAD = 0.1  # one sigma of thrust against throttle, relative

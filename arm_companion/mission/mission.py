@@ -20,10 +20,10 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
-from arm_companion.mission.load import keep_load
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
+from arm_companion.mission.sharing import keep_sharing
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
@@ -106,7 +106,7 @@ def _estimate(s: Situation) -> State:
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
         watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
-        load=keep_load(s),
+        sharing=keep_sharing(s),
     )
 
 

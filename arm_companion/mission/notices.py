@@ -16,9 +16,9 @@ from arm_companion.mission.hazards import (
     tendon_broken,
     tendon_jumped,
 )
-from arm_companion.mission.load import CARRYING
 from arm_companion.mission.machine import Warned
 from arm_companion.mission.perch import FREE_FLIGHT, GRASPING, GRIPPED, TENSE
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 
@@ -41,7 +41,7 @@ WARNINGS: tuple[Told, ...] = (
     ),
     *(
         Told(
-            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - {Phase.HOLDING} - CARRYING,
+            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - {Phase.HOLDING} - SUSPENDED,
             guard,
             Severity.WARNING,
             "no perch is begun",

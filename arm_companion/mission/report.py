@@ -4,8 +4,8 @@ import math
 
 from arm_companion.mission import actions, hazards
 from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
-from arm_companion.mission.load import SHARING
 from arm_companion.mission.motion import ZERO
+from arm_companion.mission.sharing import SHARING
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction
 

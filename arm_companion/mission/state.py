@@ -142,7 +142,7 @@ class PerchKind(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Load:
+class Sharing:
     """How arm and motors share the vehicle's weight while it hangs, or is about to.
 
     Attributes:
@@ -196,6 +196,6 @@ class State:
     lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now
     offset: Vec3 = ZERO  # m, asked move away from the anchor
     kind: PerchKind = PerchKind.ANCHOR  # of the perch ordered last
-    load: Load = Load()
+    sharing: Sharing = Sharing()
     errors: ArmFault = ArmFault.NONE  # latched until the next READY or PERCH
     warned: frozenset[str] = frozenset()  # notices already given in this phase

@@ -16,14 +16,14 @@ from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.hung_wrench import hung_wrench
-from arm_companion.mission.load import CARRYING, SHARING
 from arm_companion.mission.motion import ZERO, sub
+from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
-_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING}) | CARRYING
+_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING}) | SUSPENDED
 _FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - {Phase.STARTUP, Phase.REACH}
 _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way

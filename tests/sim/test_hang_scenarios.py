@@ -8,7 +8,7 @@ import pytest
 
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
-from arm_companion.mission.load import CARRYING
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.sim.hang_verdict import carried_share, judge_hang
 from arm_companion.sim.mjcf import GRAVITY
 from arm_companion.sim.runner import Result, fly_simulated
@@ -60,7 +60,7 @@ def test_with_motors_that_stand_the_bar_carries_all_of_it_and_nothing_opens() ->
 def test_while_the_arm_carries_its_tensions_stay_within_the_limit() -> None:
     result, verdict = disarmed()
     assert max(max(sample.truth.tension) for sample in result.flight.samples) < 1.05 * CONFIG.limits.tension_max_n
-    hung = [r for r in result.records if r.state.phase in CARRYING]
+    hung = [r for r in result.records if r.state.phase in SUSPENDED]
     assert hung
     assert not any(suspect.fault for r in hung[::50] for suspect in r.state.watch)
     hanging = {error.span: error for error in verdict.wrench}["hanging"]

@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request
-from arm_companion.mission.load import CARRYING
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Load, Phase, State
+from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Phase, Sharing, State
 
 DT = 0.01
 T0 = 100.0
 PLACE = (2.0, 0.0, -2.2)
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
-HUNG = Load(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
-HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}) | CARRYING
+HUNG = Sharing(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
+HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}) | SUSPENDED
 """Phases in which the arm is around the bar."""
 
 Change = Callable[[Facts], Facts]
@@ -39,7 +39,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "position": PLACE,
         "contact_w": PLACE,
         "anchor": ANCHOR if held else None,
-        "load": HUNG if phase in CARRYING else Load(),
+        "sharing": HUNG if phase in SUSPENDED else Sharing(),
         "tension": (8.0, 4.0, 1.0, 4.0),
         "bend": bend,
         "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
@@ -108,7 +108,7 @@ class Run:
         if setpoint is not None:
             values = (*setpoint.position_w, *setpoint.velocity_w, *setpoint.acceleration_w, setpoint.yaw)
             assert all(map(math.isfinite, values))
-            most = GRAVITY if state.phase in CARRYING else limits.feedforward_m_per_s2
+            most = GRAVITY if state.phase in SUSPENDED else limits.feedforward_m_per_s2
             assert norm(setpoint.acceleration_w) <= most + 1e-9
             fastest = max(perch.approach_speed_m_per_s, 3.0 * perch.reach_speed_m_per_s, limits.vehicle_speed_m_per_s)
             assert norm(setpoint.velocity_w) <= fastest + 1e-9
@@ -133,9 +133,9 @@ class Run:
 
 def check_load(before: State, state: State, facts: Facts, commands: Commands) -> None:
     """An arm that may carry the vehicle does not move, and never opens over stopped motors."""
-    if state.phase in CARRYING:
+    if state.phase in SUSPENDED:
         assert commands.arm is ArmAction.HOLD, "an arm that may carry the vehicle does not move"
-    if before.phase in CARRYING and state.phase not in CARRYING:
+    if before.phase in SUSPENDED and state.phase not in SUSPENDED:
         assert before.phase is Phase.TAKE_BACK
         assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
 

@@ -12,9 +12,9 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import load
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
-from arm_companion.mission.load import CARRYING
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import Load, PerchKind, Phase, State
+from arm_companion.mission.state import PerchKind, Phase, Sharing, State
 from tests.unit.conftest import HOVER, tendons
 from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Run, ask, memory, tendon, vehicle
 
@@ -72,7 +72,7 @@ def verified(**fields: object) -> State:
     known: dict[str, object] = {
         "since": T0 - 3.5,
         "kind": PerchKind.HANG,
-        "load": Load(hover=HOVER_THROTTLE),
+        "load": Sharing(hover=HOVER_THROTTLE),
         "bend": BENT,
         "bend_goal": BENT,
         "anchor": dataclasses.replace(ANCHOR, position_w=PLACE),
@@ -120,7 +120,7 @@ def test_a_vehicle_that_does_not_come_to_rest_is_not_unloaded_further(above: Par
     for i in range(2000):
         bar.cycle(position_w=(x + 0.05 * math.sin(0.016 * i), y, z))
     first = 1.0 - (1.0 - above.config.hang.idle_share) / above.config.hang.steps
-    assert bar.run.state.load.share >= first - 1e-9
+    assert bar.run.state.sharing.share >= first - 1e-9
     assert bar.run.state.phase is Phase.LOAD_TRANSFER
 
 
@@ -161,7 +161,7 @@ def test_motors_that_do_not_come_up_do_not_open_the_arm(share: float, hanging: B
         bar.run.cycle(sunk, 0.1)
     assert bar.run.state.phase is Phase.HANG_HOLD
     assert bar.run.state.errors & ArmFault.TIMEOUT
-    assert set(bar.run.phases) <= CARRYING
+    assert set(bar.run.phases) <= SUSPENDED
 
 
 def test_the_pilot_takes_it_while_it_hangs_and_lifts_it_off_himself(hanging: Bar) -> None:

@@ -6,10 +6,10 @@ import pytest
 
 from arm_companion.mission.diagram import document
 from arm_companion.mission.facts import ArmFault, ArmFlag, Order
-from arm_companion.mission.load import CARRYING
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.mission import SAFE_ACTION
 from arm_companion.mission.perch import GRASPING, GRIPPED, TABLE
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.protocol.dialect import mav
 
@@ -61,11 +61,11 @@ def test_a_gripping_arm_never_stows_or_departs_without_letting_go_first(phase: P
     }
 
 
-@pytest.mark.parametrize("phase", sorted(CARRYING, key=lambda p: p.value))
+@pytest.mark.parametrize("phase", sorted(SUSPENDED, key=lambda p: p.value))
 def test_an_arm_that_may_carry_the_vehicle_leaves_through_the_motors_alone(phase: Phase) -> None:
-    after = {target for source, target in edges() if source is phase} - CARRYING
+    after = {target for source, target in edges() if source is phase} - SUSPENDED
     assert after == ({Phase.UNLOAD} if phase is Phase.TAKE_BACK else set())
-    assert not any(row.fails for row in TABLE.transitions if phase in row.sources and row.target not in CARRYING), (
+    assert not any(row.fails for row in TABLE.transitions if phase in row.sources and row.target not in SUSPENDED), (
         "it is opened by what the motors do, never by a failure"
     )
 

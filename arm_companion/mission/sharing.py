@@ -12,12 +12,12 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Vec3
 from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, norm, ramp, scale, sub
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Load, Phase, State
+from arm_companion.mission.state import Phase, Sharing, State
 
 SHARING = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK})
 """Phases in which we say how much of the weight the motors carry."""
 
-CARRYING = SHARING | {Phase.HANG_HOLD}
+SUSPENDED = SHARING | {Phase.HANG_HOLD}
 """Phases in which the arm may be all that keeps the vehicle from falling."""
 
 _HOVERING = frozenset({Phase.APPROACH, Phase.REACH})
@@ -44,24 +44,24 @@ def throttle_known(s: Situation) -> bool:
 
 def motor_share(s: Situation) -> float | None:
     """Thrust of the motors, share of the free hover's; None when nobody knows."""
-    hover = s.state.load.hover
+    hover = s.state.sharing.hover
     return s.facts.vehicle.throttle / hover if hover > 0.0 and throttle_known(s) else None
 
 
 def sunk(s: Situation) -> float:
     """How far the vehicle is below where it was when its load began to move, m."""
-    return s.state.position[2] - s.state.load.first
+    return s.state.position[2] - s.state.sharing.first
 
 
 def slid(s: Situation) -> float:
     """The greater of the vehicle's moves down and along the bar within the last seconds, m: swinging is no slip."""
-    away = sub(s.state.position, s.state.load.place)
+    away = sub(s.state.position, s.state.sharing.place)
     return max(away[2], abs(dot(away, s.bar.axis_w)))
 
 
-def keep_load(s: Situation) -> Load:
+def keep_sharing(s: Situation) -> Sharing:
     """What is known of the load after this cycle."""
-    load, vehicle, hang = s.state.load, s.facts.vehicle, s.config.hang
+    load, vehicle, hang = s.state.sharing, s.facts.vehicle, s.config.hang
     if s.state.phase in _HOVERING and throttle_known(s) and vehicle.armed and not vehicle.landed:
         share = s.dt / (_HOVER_S + s.dt) if load.hover > 0.0 else 1.0
         return dataclasses.replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
@@ -79,7 +79,7 @@ def keep_load(s: Situation) -> Load:
 
 def _motors_carry(s: Situation) -> bool:
     """Whether the motors carry the vehicle: by their throttle, else because it has risen off the arm."""
-    if s.state.load.share < 1.0 or not s.facts.vehicle.armed or s.facts.vehicle.landed:
+    if s.state.sharing.share < 1.0 or not s.facts.vehicle.armed or s.facts.vehicle.landed:
         return False
     share = motor_share(s)
     return -sunk(s) >= _ROSE_M if share is None else share >= s.config.hang.carried_share
@@ -87,33 +87,33 @@ def _motors_carry(s: Situation) -> bool:
 
 def carried(s: Situation) -> bool:
     """Whether the motors have carried the vehicle for long enough to let go."""
-    return s.state.load.carried_s >= _CARRIED_S
+    return s.state.sharing.carried_s >= _CARRIED_S
 
 
 # --- what is done about it ---
 
 
 def begin(s: Situation) -> State:
-    """Memory at the entry of the present phase, which is one of CARRYING."""
-    state, load, position = s.state, s.state.load, s.state.position
+    """Memory at the entry of the present phase, which is one of SUSPENDED."""
+    state, load, position = s.state, s.state.sharing, s.state.position
     fresh = dataclasses.replace(load, rested_s=0.0, carried_s=0.0)
     match state.phase:
         case Phase.LOAD_TRANSFER:
             load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0, place=position, first=position[2])
             rest = add(s.probe, (0.0, 0.0, _BELOW_GRIP_M))
-            return dataclasses.replace(state, load=_next_step(s, load, -1.0), rest=rest)
+            return dataclasses.replace(state, sharing=_next_step(s, load, -1.0), rest=rest)
         case Phase.TAKE_BACK:
             load = dataclasses.replace(fresh, place=position, first=position[2])
-            return dataclasses.replace(state, load=_next_step(s, load, 1.0))
+            return dataclasses.replace(state, sharing=_next_step(s, load, 1.0))
         case Phase.HANG_HOLD:
             load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0)
-            return dataclasses.replace(state, load=load, bend=s.bend, bend_goal=s.bend, pulls=())
-    return dataclasses.replace(state, load=fresh)
+            return dataclasses.replace(state, sharing=load, bend=s.bend, bend_goal=s.bend, pulls=())
+    return dataclasses.replace(state, sharing=fresh)
 
 
-def share_on(s: Situation) -> Load:
+def share_on(s: Situation) -> Sharing:
     """The shares after this cycle: towards the present step's, and on to the next one once the vehicle rests."""
-    load, hang = s.state.load, s.config.hang
+    load, hang = s.state.sharing, s.config.hang
     if s.state.phase not in SHARING:
         return load
     urgent = s.state.phase is Phase.TAKE_BACK and bool(s.state.errors)
@@ -130,7 +130,7 @@ def share_on(s: Situation) -> Load:
     return dataclasses.replace(load, share=share, trim=min(max(trim, -_TRIM_MAX), _TRIM_MAX))
 
 
-def _next_step(s: Situation, load: Load, way: float) -> Load:
+def _next_step(s: Situation, load: Sharing, way: float) -> Sharing:
     """The load with the next step's share, down (-1) or up (+1); a new step has not rested yet."""
     hang = s.config.hang
     stride = (1.0 - hang.idle_share) / hang.steps
@@ -144,7 +144,7 @@ def _next_step(s: Situation, load: Load, way: float) -> Load:
 
 def unloading(s: Situation) -> Vec3:
     """Acceleration, m/s^2, world axes, that leaves the motors their share of the weight; never more than gravity."""
-    load = s.state.load
+    load = s.state.sharing
     return (0.0, 0.0, min(max((1.0 - load.share) * GRAVITY + load.trim, 0.0), GRAVITY))
 
 
@@ -158,10 +158,10 @@ def hung_reference(s: Situation, before: Reference) -> Reference:
     if s.facts.vehicle.landed and state.phase is Phase.TAKE_BACK:
         x, y, z = state.position
         return Reference((x, y, z - _OFF_THE_GROUND_M), ZERO, before.yaw)
-    if state.phase is not Phase.TAKE_BACK or state.load.share < 1.0:
+    if state.phase is not Phase.TAKE_BACK or state.sharing.share < 1.0:
         return Reference(state.position, ZERO, before.yaw)
-    x, y, _ = state.load.place if state.anchor is None else s.rest
-    top = state.load.first - _LIFT_M
+    x, y, _ = state.sharing.place if state.anchor is None else s.rest
+    top = state.sharing.first - _LIFT_M
     if before.position[2] < top:  # it has just left what it thought was the ground
         before = Reference(state.position, ZERO, before.yaw)
     return follow(
