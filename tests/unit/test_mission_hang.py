@@ -72,7 +72,7 @@ def verified(**fields: object) -> State:
     known: dict[str, object] = {
         "since": T0 - 3.5,
         "kind": PerchKind.HANG,
-        "load": Sharing(hover=HOVER_THROTTLE),
+        "sharing": Sharing(hover=HOVER_THROTTLE),
         "bend": BENT,
         "bend_goal": BENT,
         "anchor": dataclasses.replace(ANCHOR, position_w=PLACE),
@@ -148,7 +148,10 @@ def test_released_from_hanging_the_motors_take_the_load_in_steps_before_the_arm_
     assert bar.throttle == pytest.approx(HOVER_THROTTLE)
     assert bar.run.said[-1].setpoint is not None
     assert bar.run.said[-1].setpoint.acceleration_w == (0.0, 0.0, 0.0)
-    bar.until(Phase.RELEASE, 10.0)
+    bar.until(Phase.RELEASE, 15.0)
+    last = bar.run.said[-1].setpoint
+    assert last is not None
+    assert last.position_w[2] > PLACE[2] + 0.01, "from below the grip, so that the mount stays clear of the bar"
 
 
 @pytest.mark.parametrize("share", [0.3, 0.8])
