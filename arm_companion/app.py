@@ -16,6 +16,7 @@ from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.field_page import FieldPage
 from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
@@ -32,7 +33,7 @@ from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError, DeviceFault, ModelError
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.record import configured_recorder
 from arm_companion.record.raw import tapped
@@ -134,6 +135,9 @@ class Daemon:
         self._mqtt = MqttPublisher(config.mqtt, clock, self._component.commands) if config.mqtt.host else None
         if self._mqtt is not None:
             self._component.hearers.append(self._mqtt.event)
+        self._page = FieldPage(config, clock, self._component.commands) if config.page.host else None
+        if self._page is not None:
+            self._component.hearers.append(self._page.event)
         self._started = clock.now()
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
         self._bus = ServoBus(
@@ -173,7 +177,7 @@ class Daemon:
                 self._component.run,
                 self._keys.run,
                 self._bus.run,
-                *(() if self._mqtt is None else (self._mqtt.run,)),
+                *(part.run for part in (self._mqtt, self._page) if part is not None),
                 self._cycles,
             )
         finally:
@@ -337,6 +341,8 @@ class Daemon:
         )
         if self._mqtt is not None:
             self._mqtt.publish(now, facts, commands, self._health)
+        if self._page is not None:
+            self._page.publish(now, Situation(self._state, facts, now, self._parameters), commands, self._health)
 
     def _health(self) -> Health:
         links = {link.name: link.connected for link in self._links}
