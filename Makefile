@@ -23,11 +23,12 @@ $(STAMP): pyproject.toml constraints.txt hatch_build.py arm_companion/protocol/d
 demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated world
 	@$(BIN)/arm-companion sim perch --output build/demo
 
-test: $(STAMP)  ## run the tests
-	@$(BIN)/python -m pytest -m 'not scenario and not soak'
+test: $(STAMP)  ## run the tests: what has its own time on all cores, then what runs against the wall clock alone
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak'
+	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
-	@$(BIN)/python -m pytest -m scenario
+	@$(BIN)/python -m pytest -n auto --dist load -m scenario
 
 soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questions to the mechanics: none may go wrong
 	@$(BIN)/python -m pytest -m soak

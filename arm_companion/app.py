@@ -77,6 +77,19 @@ def open_configured(config: Config) -> Openers:
     )
 
 
+def check_flyable(config: Config) -> None:
+    """Refuse what suits research and cannot be flown.
+
+    Raises:
+        ConfigError: no link to the autopilot, an arm of several segments, or servos that do not suit the tendons.
+    """
+    if not any(link.role == "autopilot" for link in config.links.values()):
+        raise ConfigError("links: none has the role autopilot")
+    if config.arm.segments:
+        raise ConfigError("arm.segments: the perch is flown by an arm of one segment")
+    config.check_servos()
+
+
 class Daemon:
     """Everything that runs on the companion computer, and the cycle that drives it."""
 
@@ -91,11 +104,7 @@ class Daemon:
         compiled_model: bool = False,
         model: ArmModel | None = None,
     ) -> None:
-        if not any(link.role == "autopilot" for link in config.links.values()):
-            raise ConfigError("links: none has the role autopilot")
-        if config.arm.segments:
-            raise ConfigError("arm.segments: the perch is flown by an arm of one segment")
-        config.check_servos()
+        check_flyable(config)
         self._config = config
         self._clock = clock
         self._manager = manager

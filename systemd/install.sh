@@ -131,11 +131,11 @@ make_directories() {
 }
 
 make_configuration() {
-    if [ -e "$ETC/arm.toml" ]; then
-        say kept "$ETC/arm.toml"
+    if [ -e "$ETC/config.toml" ]; then
+        say kept "$ETC/config.toml"
     else
-        say write "$ETC/arm.toml"
-        do_ install -D -m 0644 "$SOURCE/systemd/arm.toml" "$ETC/arm.toml"
+        say write "$ETC/config.toml"
+        do_ install -D -m 0644 "$SOURCE/systemd/config.toml" "$ETC/config.toml"
     fi
 }
 
@@ -197,7 +197,7 @@ install_() {
         if [ "$ACTION" = upgrade ]; then do_ systemctl try-restart $NAME; fi
         if [ -n "$START" ]; then do_ systemctl start $NAME; fi
     fi
-    say next "edit $ETC/arm.toml, then: $NAME doctor --config $ETC/arm.toml"
+    say next "edit $ETC/config.toml, then: $NAME doctor --config $ETC/config.toml"
 }
 
 uninstall() {

@@ -16,7 +16,7 @@ from arm_companion.cli import calibrate_tendons, calibrate_tension
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.cli.numbers import NumberParser
 from arm_companion.config import Config, load
-from arm_companion.config.load import locate
+from arm_companion.config.layers import locate
 from arm_companion.errors import ArmError, ConfigError
 from arm_companion.experiments import case, loading_csv
 
@@ -115,8 +115,9 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
     fit = identification.fit(parameters, test, names, mu=config.arm.tendons.guide_friction, fast=_compiled())
     if arguments.output is not None:
         arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        arguments.output.write_text(drop_in(fit, config, locate(arguments.config), arguments.output), encoding="utf-8")
-        load(arguments.output)  # what is written must be usable
+        base = locate(arguments.config)
+        arguments.output.write_text(drop_in(fit, config, base, arguments.output), encoding="utf-8")
+        load(base if _among_drop_ins(base, arguments.output) else arguments.output)  # what is written must be usable
     if arguments.figure is not None:
         from arm_companion.experiments import figures  # noqa: PLC0415 - matplotlib is optional
 
@@ -137,10 +138,9 @@ def _compiled() -> bool:
 def drop_in(fit: Fit, config: Config, base: Path, target: Path) -> str:
     """TOML that extends the configuration `base` by what was fitted, to be written to `target`."""
     beside = base.resolve().parent == target.resolve().parent
-    lines = [
-        "# Written by `arm-companion calibrate stiffness`; intervals are of 95 % confidence.",
-        f"extends = {json.dumps(base.name if beside else str(base.resolve()))}",
-    ]
+    lines = ["# Written by `arm-companion calibrate stiffness`; intervals are of 95 % confidence."]
+    if not _among_drop_ins(base, target):
+        lines.append(f"extends = {json.dumps(base.name if beside else str(base.resolve()))}")
     estimates = fit.estimates
     if estimates["EI"].fitted:
         lines += ["", "[arm.backbone]", *_entry("EI", fit)]
@@ -156,6 +156,11 @@ def drop_in(fit: Fit, config: Config, base: Path, target: Path) -> str:
     if tendons:
         lines += ["", "[arm.tendons]", *tendons]
     return "\n".join(lines) + "\n"
+
+
+def _among_drop_ins(base: Path, target: Path) -> bool:
+    """Whether `target` lies where the configuration `base` takes its drop-ins from by itself."""
+    return target.resolve().parent == base.with_suffix(".d").resolve()
 
 
 def _entry(name: str, fit: Fit) -> list[str]:

@@ -1,19 +1,15 @@
 """What several commands share."""
 
 import argparse
+import os
 
 from arm_companion.config import Config, load
+from arm_companion.config.layers import SYSTEM_FILE
 
 
-def add_config_arguments(parser: argparse.ArgumentParser, default: str | None = None) -> None:
+def add_config_arguments(parser: argparse.ArgumentParser, default: str = str(SYSTEM_FILE)) -> None:
     """`--config` and `--set`."""
-    parser.add_argument(
-        "--config",
-        metavar="FILE",
-        default=default,
-        required=default is None,
-        help="configuration file" + (f" (default: {default})" if default else ""),
-    )
+    parser.add_argument("--config", metavar="FILE", default=default, help=f"configuration file (default: {default})")
     parser.add_argument(
         "--set",
         metavar="KEY=VALUE",
@@ -25,9 +21,9 @@ def add_config_arguments(parser: argparse.ArgumentParser, default: str | None = 
 
 
 def load_from(arguments: argparse.Namespace) -> Config:
-    """The configuration that the arguments name.
+    """The configuration that the arguments name, with what the environment overrides.
 
     Raises:
         ConfigError: it cannot be used.
     """
-    return load(arguments.config, arguments.settings)
+    return load(arguments.config, arguments.settings, os.environ)

@@ -199,7 +199,7 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
 def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
     perched = next((w for w in verdict.wrench if w.span == "perched"), None)
-    moves = [move.error_m for move in verdict.moves]
+    errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
     return {
         "scenario": "perch",
@@ -208,8 +208,9 @@ def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
         "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
         "wrench_rms_error_n": _number(perched.force_error_n if perched else math.nan),
         "wrench_rms_n": _number(perched.true_force_n if perched else math.nan),
-        "pose_error_with_m": _number(max(moves) if moves else math.nan),
-        "pose_error_without_m": None,
+        "pose_error_with_m": _number(errors.get("pull x", math.nan)),
+        "pose_error_without_m": _number(errors.get("pull x, not compensated", math.nan)),
+        "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],
         "cycles": result.cycles,
         "missed_cycles": result.missed,
         "wall_s": round(wall_s, 3),

@@ -10,13 +10,16 @@ import difflib
 import math
 import types
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from arm_companion.errors import ConfigError
 
 T = TypeVar("T")
+Source = Callable[[str], str]
+"""Who gave the value of a dotted key: a file, a variable, a setting."""
+
 _META = "option"
 
 
@@ -39,8 +42,8 @@ class Option:
         if math.isinf(self.lower) and math.isinf(self.upper):
             return f"any finite number{unit}"
         if math.isinf(self.upper):
-            return f"at least {self.lower:g}{unit}"
-        return f"{self.lower:g} to {self.upper:g}{unit}"
+            return f"at least {self.lower:.10g}{unit}"
+        return f"{self.lower:.10g} to {self.upper:.10g}{unit}"
 
 
 def option(
@@ -85,13 +88,26 @@ def describe(f: "dataclasses.Field[Any]") -> Option | None:
     return typing.cast("Option | None", f.metadata.get(_META))
 
 
-def read(cls: type[T], table: Mapping[str, Any], source: str, path: str = "") -> T:
+def spelling(cls: Any, parts: Sequence[str]) -> list[str]:
+    """The parts of a dotted key as the options are spelt, capitals in `parts` aside; unknown parts stay as they are."""
+    if not parts or not dataclasses.is_dataclass(cls):
+        return list(parts)
+    hints = typing.get_type_hints(cls)
+    known = {f.name.lower(): f.name for f in dataclasses.fields(cls)}
+    name = known.get(parts[0].lower(), parts[0])
+    inner, below = hints.get(name), list(parts[1:])
+    if typing.get_origin(inner) in (dict, Mapping) and below:  # [links.NAME]: the name is the user's
+        return [name, below[0], *spelling(typing.get_args(inner)[1], below[1:])]
+    return [name, *spelling(inner, below)]
+
+
+def read(cls: type[T], table: Mapping[str, Any], source: Source, path: str = "") -> T:
     """Build section `cls` from a TOML table.
 
     Args:
         cls: a frozen dataclass of options and nested sections.
         table: what the TOML file holds at this place.
-        source: file name, for messages.
+        source: tells the origin of a key, for messages.
         path: dotted key of `table` in the file, for messages.
 
     Raises:
@@ -104,7 +120,9 @@ def read(cls: type[T], table: Mapping[str, Any], source: str, path: str = "") ->
             close = difflib.get_close_matches(key, fields, n=1)
             hint = f"; did you mean '{_join(path, close[0])}'?" if close else ""
             known = ", ".join(sorted(fields))
-            raise ConfigError(f"{source}: unknown key '{_join(path, key)}'{hint} (known here: {known})")
+            raise ConfigError(
+                f"{source(_join(path, key))}: unknown key '{_join(path, key)}'{hint} (known here: {known})"
+            )
     values: dict[str, Any] = {}
     for name, f in fields.items():
         key = _join(path, name)
@@ -112,17 +130,17 @@ def read(cls: type[T], table: Mapping[str, Any], source: str, path: str = "") ->
             if f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING:
                 meta = describe(f)
                 needs = f" ({meta.doc}; {meta.allowed()})" if meta else ""
-                raise ConfigError(f"{source}: required key '{key}' is missing{needs}")
+                raise ConfigError(f"{source(key)}: required key '{key}' is missing{needs}")
             continue
         values[name] = _convert(hints[name], table[name], describe(f) or Option(""), source, key)
     try:
         return cls(**values)
     except ConfigError as error:  # a rule that spans several keys, from __post_init__
         where = f"[{path}]: " if path else ""
-        raise ConfigError(f"{source}: {where}{error}") from None
+        raise ConfigError(f"{source(path)}: {where}{error}") from None
 
 
-def _convert(hint: Any, value: Any, meta: Option, source: str, key: str) -> Any:
+def _convert(hint: Any, value: Any, meta: Option, source: Source, key: str) -> Any:
     origin = typing.get_origin(hint)
     if origin is types.UnionType or origin is typing.Union:
         (hint,) = (a for a in typing.get_args(hint) if a is not type(None))
@@ -148,7 +166,7 @@ def _convert(hint: Any, value: Any, meta: Option, source: str, key: str) -> Any:
     return _scalar(hint, value, meta, source, key)
 
 
-def _scalar(hint: Any, value: Any, meta: Option, source: str, key: str) -> Any:
+def _scalar(hint: Any, value: Any, meta: Option, source: Source, key: str) -> Any:
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not hint:
@@ -162,8 +180,8 @@ def _scalar(hint: Any, value: Any, meta: Option, source: str, key: str) -> Any:
     return value
 
 
-def _refusal(source: str, key: str, value: Any, allowed: str) -> ConfigError:
-    return ConfigError(f"{source}: {key} = {value!r} is not allowed: {allowed}")
+def _refusal(source: Source, key: str, value: Any, allowed: str) -> ConfigError:
+    return ConfigError(f"{source(key)}: {key} = {value!r} is not allowed: {allowed}")
 
 
 def _join(path: str, name: str) -> str:

@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from arm_companion.config.load import apply_setting
+from arm_companion.config.layers import apply_setting
 from arm_companion.config.options import read
 from arm_companion.config.schema import Config
 
@@ -28,7 +28,7 @@ def from_table(table: Mapping[str, Any], source: str, settings: Iterable[str] = 
     for setting in settings:
         apply_setting(known, setting)
         source = f"{source} with --set"
-    return read(Config, known, source)
+    return read(Config, known, lambda _: source)
 
 
 def _without_none(value: Any) -> Any:

@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, Final
 
-from arm_companion.config.load import files_of
+from arm_companion.config.layers import files_of
 from arm_companion.config.schema import Config
 from arm_companion.doctor.check import Finding
 from arm_companion.doctor.redaction import literal_secrets, redact, secret_files, secrets_in

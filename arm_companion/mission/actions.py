@@ -52,6 +52,9 @@ _FAR_FACTOR = 3.0
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
 _AT_REST_M = 0.002
+_TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
+_BEND_AHEAD_RAD = 0.25  # three times what servos lag by while they curl the arm
+_BEHIND_CURL_M = 0.1  # a wrap in still air is followed within 5 cm
 _LEAN_RATE = 1.0  # m/s^3
 _TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that is still to go
 
@@ -107,13 +110,40 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
-    speed = s.config.perch.bend_speed_rad_per_s
+    if _tight_enough(s):
+        state = dataclasses.replace(state, bend_goal=state.bend)
+    speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
     pulls = state.pulls
     if bend != state.bend or not pulls:
         goal = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))
         pulls = tuple(float(pull) for pull in goal)
     return dataclasses.replace(state, bend=bend, pulls=pulls), ArmAction.DRIVE, pulls
+
+
+def _tight_enough(s: Situation) -> bool:
+    """Whether a wrap ends before its full bend, because a tendon comes close to its limit.
+
+    A bar thicker, or a backbone stiffer, than believed: the pull test says whether this grip holds.
+    """
+    if s.state.phase is not Phase.WRAP or s.state.bend == s.state.bend_goal:
+        return False
+    return max(s.state.tension, default=0.0) >= _TIGHT_SHARE * s.config.limits.tension_max_n
+
+
+def _ahead_of_the_others(s: Situation) -> bool:
+    """Whether the commanded curl has to wait, for servos that turn late or a vehicle that does not follow a wrap.
+
+    Bending on regardless would end in a jerk of servos that catch up, or in a bar that pulls the vehicle over. An
+    arm that lets go waits for its servos alone: the vehicle may be what holds it up.
+    """
+    reference, phase = s.state.reference, s.state.phase
+    if phase not in (Phase.WRAP, Phase.RELEASE) or reference is None:
+        return False
+    if s.bend_error > _BEND_AHEAD_RAD:
+        return True
+    behind = norm(sub(reference.position, s.facts.vehicle.position_w))
+    return phase is Phase.WRAP and (behind > _BEHIND_CURL_M or not s.vehicle_fresh)
 
 
 def _pretension(s: Situation, theta: float) -> float:

@@ -124,18 +124,26 @@ class Operator:
         await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
 
     async def _pull(self) -> None:
-        """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, and back each time."""
+        """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, then x without compensation."""
         await asyncio.sleep(2.0)
         await self._measure("hold", (0.0, 0.0, 0.0), _HOLD_S)
-        for name, move in (("x", (_PULL_M, 0.0, 0.0)), ("z", (0.0, 0.0, _PULL_M))):
-            self._say(f"pull 10 mm in {name}")
-            await self._jog(move)
-            await asyncio.sleep(_PULL_S)
-            await self._measure(f"pull {name}", move, _HOLD_S)
-            await self._jog((0.0, 0.0, 0.0))
-            await asyncio.sleep(_PULL_S)
+        x, z = (_PULL_M, 0.0, 0.0), (0.0, 0.0, _PULL_M)
+        await self._pull_to("pull x", x)
+        await self._pull_to("pull z", z)
+        await self._compensate(on=False)
+        await self._pull_to("pull x, not compensated", x)
+        await self._compensate(on=True)
         if self._state() != "PERCHED":
             raise ScenarioFailed(f"the perch ended by itself in {self._state()}")
+
+    async def _pull_to(self, name: str, move: Vec3) -> None:
+        """One move away from where the vehicle rests, and back."""
+        self._say(f"{name}: 10 mm")
+        await self._jog(move)
+        await asyncio.sleep(_PULL_S)
+        await self._measure(name, move, _HOLD_S)
+        await self._jog((0.0, 0.0, 0.0))
+        await asyncio.sleep(_PULL_S)
 
     async def _release(self) -> None:
         self._say("RELEASE")
@@ -172,6 +180,12 @@ class Operator:
         result = await self._link.command(mav.MAV_CMD_ARM_JOG, parameters, target=self._arm, timeout=5.0)
         if result != mav.MAV_RESULT_ACCEPTED:
             raise ScenarioFailed(f"JOG: {self._why(result)}")
+
+    async def _compensate(self, *, on: bool) -> None:
+        parameters = [float(on), *[0.0] * 6]
+        result = await self._link.command(mav.MAV_CMD_ARM_FEEDFORWARD, parameters, target=self._arm, timeout=5.0)
+        if result != mav.MAV_RESULT_ACCEPTED:
+            raise ScenarioFailed(f"FEEDFORWARD: {self._why(result)}")
 
     async def _vehicle(self, command: int, parameters: list[float], what: str, retry_s: float = 0.0) -> None:
         """A command to the autopilot, repeated for `retry_s` while it is not ready yet."""

@@ -7,6 +7,7 @@ import collections
 import dataclasses
 import math
 import multiprocessing
+import os
 import random
 import re
 from collections.abc import Callable, Sequence
@@ -188,7 +189,7 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int) -> Outcome:
     Raises:
         ConfigError: the configuration cannot be used.
     """
-    config = load(file, settings)
+    config = load(file, settings, os.environ)
     drawn = draw(config, seed)
     result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world))
     verdict = judge(result.flight, result.failure)

@@ -109,6 +109,14 @@ def test_the_anchored_vehicle_goes_where_it_is_pulled() -> None:
     assert verdict.hover_error_m < 0.005
 
 
+def test_compensation_makes_the_move_that_the_vehicle_alone_does_not() -> None:
+    """Both in one flight: what is asked for stays off by less than a third of what it is off by without."""
+    _, verdict = perch()
+    pull = {move.name: move for move in verdict.moves}
+    assert pull["pull x"].error_m < 0.3 * pull["pull x, not compensated"].error_m
+    assert pull["pull x, not compensated"].made_m < 0.005
+
+
 def test_the_predicted_wrench_is_the_plants() -> None:
     _, verdict = perch()
     error = {wrench.span: wrench for wrench in verdict.wrench}

@@ -8,7 +8,7 @@ import pytest
 
 SCRIPT = Path(__file__).parents[2] / "systemd" / "install.sh"
 UNIT = "etc/systemd/system/arm-companion.service"
-CONFIG = "etc/arm-companion/arm.toml"
+CONFIG = "etc/arm-companion/config.toml"
 STATE = "var/lib/arm-companion"
 
 
