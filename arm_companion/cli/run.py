@@ -6,7 +6,7 @@ import logging
 import sys
 
 from arm_companion.app import Daemon, open_configured
-from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
 from arm_companion.drivers.settings import with_kept_changes
 from arm_companion.drivers.standard_services import Power
@@ -21,6 +21,7 @@ START_AGAIN = 75
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion run`."""
     add_config_arguments(parser)
+    add_live_argument(parser)
     parser.add_argument("--verbose", action="store_true", help="log every state of links and servos")
 
 
@@ -42,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
         manager = ServiceManager()
         try:
             clock = Clock(asyncio.get_running_loop(), unix_now())
-            daemon = Daemon(config, open_configured(config), clock, manager, compiled_model=True)
+            daemon = Daemon(config, open_configured(config), clock, manager, compiled_model=True, live=arguments.live)
             await daemon.run(stop)
             return START_AGAIN if daemon.power is Power.RESTART else 0
         finally:

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="perch: take off, wrap a bar, be pulled, let go, land; world: no script, your own ground station flies",
     )
     add_config_arguments(parser, default="sim.toml")
+    add_live_argument(parser)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
     parser.add_argument(
@@ -67,6 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Fly the scenario; exit code 0 only when it perched and let go."""
     if arguments.trials is not None and not (arguments.simulated and arguments.scenario == "perch"):
         print("arm-companion sim: --trials flies the perch in simulated time: sim perch --simulated", file=sys.stderr)
+        return 2
+    if arguments.live is not None and arguments.simulated:
+        print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
         return 2
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
@@ -193,6 +197,8 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
     words = ["run", "--config", arguments.config]
     for setting in (*arguments.settings, f'record.file="{_record_path(arguments).resolve()}"'):
         words += ["--set", setting]
+    if arguments.live is not None:
+        words += ["--live", str(arguments.live)]
     return words
 
 
