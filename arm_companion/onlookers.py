@@ -1,4 +1,4 @@
-"""Who looks at the arm from outside of MAVLink: the broker, the field page, the live view. None of them costs a cycle."""
+"""Who looks at the arm from outside of MAVLink: the broker, the field page, the live view. None costs a cycle."""
 
 from collections.abc import Awaitable, Callable
 

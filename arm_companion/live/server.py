@@ -1,7 +1,7 @@
 """Foxglove's websocket, in a process of its own: `python -m arm_companion.live.server`.
 
-It is fed (see `side_process`) with the messages of a record, each `"<Unix time in ns> <JSON>"`, and with `scene`. How many
-of its channels somebody looks at goes back as `["viewers", number]`. Clients can look, and nothing else: none of the
+It is fed (see `side_process`) with the messages of a record, each `"<Unix time in ns> <JSON>"`, and with `scene`. How
+many of its channels somebody looks at goes back as `["viewers", number]`. Clients can look, and nothing else: none of the
 protocol's ways to change something is offered.
 """
 
@@ -37,10 +37,7 @@ class LiveServer:
         self._viewers = viewers
         self._context = foxglove.Context()
         self._channels = {
-            topic: foxglove.Channel(
-                topic, schema=SCHEMAS[topic][1] | {"title": SCHEMAS[topic][0]}, context=self._context
-            )
-            for topic in TOPICS
+            topic: foxglove.Channel(topic, schema=_titled(*SCHEMAS[topic]), context=self._context) for topic in TOPICS
         }
         self._scene = SceneUpdateChannel("/scene", context=self._context)
         self._transforms = FrameTransformsChannel("/tf", context=self._context)
@@ -74,8 +71,8 @@ class LiveServer:
         """Tell of viewers, and repeat the configuration for those that are new, until cancelled."""
         while True:
             await asyncio.sleep(_LOOK_S)
-            channels = (*self._channels.values(), self._scene, self._transforms)
-            watched = sum(channel.has_sinks() for channel in channels)
+            watched = sum(channel.has_sinks() for channel in self._channels.values())
+            watched += self._scene.has_sinks() + self._transforms.has_sinks()
             if watched == self._watched:
                 continue
             if watched > self._watched and self._configuration is not None:
@@ -83,6 +80,11 @@ class LiveServer:
                 self._channels[CONFIGURATION].log(text, log_time=ns)
             self._watched = watched
             self._viewers(watched)
+
+
+def _titled(name: str, schema: dict[str, Any]) -> dict[str, Any]:
+    """Foxglove takes a JSON schema's title for its name."""
+    return schema | {"title": name}
 
 
 def main(settings: dict[str, Any]) -> tuple[Take, Awaitable[None]]:
