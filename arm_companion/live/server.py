@@ -1,8 +1,8 @@
 """Foxglove's websocket, in a process of its own: `python -m arm_companion.live.server`.
 
 It is fed (see `side_process`) with the messages of a record, each `"<Unix time in ns> <JSON>"`, and with `scene`. How
-many of its channels somebody looks at goes back as `["viewers", number]`. Clients can look, and nothing else: none of the
-protocol's ways to change something is offered.
+many of its channels somebody looks at goes back as `["viewers", number]`. Clients can look, and nothing else: none of
+the protocol's ways to change something is offered.
 """
 
 import asyncio
@@ -12,6 +12,7 @@ from typing import Any, Final
 
 import foxglove
 from foxglove.channels import FrameTransformsChannel, SceneUpdateChannel
+from foxglove.websocket import ChannelView, Client, ServerListener
 
 from arm_companion.drivers.side_child import Take, run, tell
 from arm_companion.live.scene import scene, transforms
@@ -51,7 +52,12 @@ class LiveServer:
             RuntimeError: it cannot be had.
         """
         return foxglove.start_server(
-            name=self._name, host=host, port=port, context=self._context, message_backlog_size=_BACKLOG
+            name=self._name,
+            host=host,
+            port=port,
+            context=self._context,
+            message_backlog_size=_BACKLOG,
+            server_listener=_Newcomers(asyncio.get_running_loop(), self._repeat_configuration),
         )
 
     def take(self, topic: str, payload: str) -> None:
@@ -68,18 +74,33 @@ class LiveServer:
         self._channels[topic].log(text, log_time=ns)
 
     async def watch(self) -> None:
-        """Tell of viewers, and repeat the configuration for those that are new, until cancelled."""
+        """Tell of viewers, until cancelled."""
         while True:
             await asyncio.sleep(_LOOK_S)
             watched = sum(channel.has_sinks() for channel in self._channels.values())
             watched += self._scene.has_sinks() + self._transforms.has_sinks()
-            if watched == self._watched:
-                continue
-            if watched > self._watched and self._configuration is not None:
-                text, ns = self._configuration
-                self._channels[CONFIGURATION].log(text, log_time=ns)
-            self._watched = watched
-            self._viewers(watched)
+            if watched != self._watched:
+                self._watched = watched
+                self._viewers(watched)
+
+    def _repeat_configuration(self) -> None:
+        """It is said once and seldom again, so who comes later would not know it."""
+        if self._configuration is not None:
+            text, ns = self._configuration
+            self._channels[CONFIGURATION].log(text, log_time=ns)
+
+
+class _Newcomers(ServerListener):
+    """Told by the server's own thread who begins to look at what."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, repeat: Callable[[], None]) -> None:
+        self._loop = loop
+        self._repeat = repeat
+
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:  # noqa: ARG002 - as the library calls it
+        """See `ServerListener`."""
+        if channel.topic == CONFIGURATION:
+            self._loop.call_soon_threadsafe(self._repeat)
 
 
 def _titled(name: str, schema: dict[str, Any]) -> dict[str, Any]:

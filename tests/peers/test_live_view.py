@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import dataclasses
+import functools
 import json
 import re
 import struct
@@ -41,6 +42,7 @@ GOLDEN = ROOT / "tests" / "golden" / "perch.mcap"
 WIRE = struct.Struct("<BIQ")
 
 
+@functools.cache
 def flown(wanted: bool) -> tuple[Record, Situation]:
     """A cycle of the golden flight, and the same after its step: of a held arm, or of a free one."""
     state, parameters = State(), None
@@ -93,7 +95,10 @@ async def client(port: int) -> AsyncIterator[Client]:
     for attempt in range(200):
         try:
             socket = await websockets.connect(
-                f"ws://127.0.0.1:{port}", subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")], max_size=None
+                f"ws://127.0.0.1:{port}",
+                subprotocols=[websockets.Subprotocol("foxglove.sdk.v1")],
+                max_size=None,
+                close_timeout=1.0,
             )
             break
         except OSError:
@@ -104,7 +109,7 @@ async def client(port: int) -> AsyncIterator[Client]:
 
 
 def test_another_client_sees_the_topics_of_a_record_and_a_scene() -> None:
-    record, cycle = flown(wanted=True)
+    record, cycle = flown(True)
 
     async def main() -> None:
         port = free_udp_port()
@@ -155,7 +160,7 @@ def test_another_client_sees_the_topics_of_a_record_and_a_scene() -> None:
 
 
 def test_a_client_that_reads_nothing_delays_neither_the_loop_nor_the_others() -> None:
-    record, cycle = flown(wanted=False)
+    record, cycle = flown(False)
 
     async def main() -> None:
         port = free_udp_port()
@@ -220,7 +225,7 @@ def test_the_whole_daemon_serves_it_and_a_plain_http_request_gets_nothing(tmp_pa
 def table(*, held: bool) -> dict[str, Any]:
     from arm_companion.live.feed import _drawn
 
-    return _drawn(*flown(wanted=held))
+    return _drawn(*flown(held))
 
 
 def test_the_scene_has_vehicle_arm_bar_and_wrench_and_leaves_out_what_is_not_known() -> None:

@@ -183,7 +183,8 @@ def test_what_fails_in_it_never_reaches_the_cycle(caplog: pytest.LogCaptureFixtu
 
     async def test(page: FieldPage, _: Component, clock: Clock) -> None:
         page._hear("viewers", "1")
-        page.publish(clock.now(), cycle(clock), COMMANDS, broken)
+        for _ in range(5):
+            page.publish(clock.now(), cycle(clock), COMMANDS, broken)
         assert [topic for topic, _ in told(page)] == ["state", "wrench", "tendons", "arm"]
 
     with_page(test)
