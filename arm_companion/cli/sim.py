@@ -16,6 +16,7 @@ from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
 _SCENARIOS = ("perch", "world")
+_FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -42,6 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         default=os.cpu_count() or 1,
         help="processes that fly trials at the same time (default: one a processor)",
+    )
+    parser.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help=f"draw the flight off-screen when it is over, as {', '.join(_FILMS)}; takes OpenGL and ffmpeg",
     )
     parser.add_argument("--json", action="store_true", help="print the verdict as one JSON object on the last line")
     parser.add_argument(
@@ -72,6 +79,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.live is not None and arguments.simulated:
         print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
         return 2
+    if arguments.video is not None and (why := _no_video(arguments)):
+        print(f"arm-companion sim: --video {why}", file=sys.stderr)
+        return 2
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
@@ -83,6 +93,15 @@ def run(arguments: argparse.Namespace) -> int:
         return _trials(arguments, config)
     arguments.output.mkdir(parents=True, exist_ok=True)
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
+
+
+def _no_video(arguments: argparse.Namespace) -> str:
+    """Why there can be no film whatever is installed; empty: there can."""
+    if arguments.scenario != "perch" or arguments.trials is not None:
+        return "films one flight: sim perch without --trials"
+    if arguments.video.suffix not in _FILMS:
+        return f"{arguments.video}: a film's name ends with one of {', '.join(_FILMS)}"
+    return ""
 
 
 def _serve(arguments: argparse.Namespace, config: Config) -> int:
@@ -106,17 +125,27 @@ def _serve(arguments: argparse.Namespace, config: Config) -> int:
 
 
 def _fly(arguments: argparse.Namespace, config: Config) -> int:
-    from arm_companion.sim.figure import draw  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim import film  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.figure import draw  # noqa: PLC0415
     from arm_companion.sim.progress import Progress, show_verdict  # noqa: PLC0415
     from arm_companion.sim.verdict import judge  # noqa: PLC0415
+    from arm_companion.sim.world import World  # noqa: PLC0415
 
     output: Path = arguments.output
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
     try:
-        result = (
-            _simulated(arguments, config, progress) if arguments.simulated else _real_time(arguments, config, progress)
-        )
+        studio = None if arguments.video is None else film.studio()
+    except film.NoFilm as error:
+        print(f"arm-companion sim: no video: {error}", file=sys.stderr)
+        return 2
+
+    def prepare(world: World) -> None:
+        world.pose_every_s = None if studio is None else 1.0 / film.PICTURES_PER_S
+
+    try:
+        fly = _simulated if arguments.simulated else _real_time
+        result = fly(arguments, config, progress, prepare)
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
@@ -127,11 +156,21 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     start = result.flight.samples[0].t if result.flight.samples else 0.0
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
     _write_truth(arguments, result.flight)
-    show_verdict(verdict, progress.console, [figure, log, _record_path(arguments)])
+    files = [figure, log, _record_path(arguments)]
+    filmed = True
+    if studio is not None:
+        progress.say(f"drawing {len(result.poses)} pictures")
+        try:
+            film.make(arguments.video, config, result.poses, studio)
+            files.append(arguments.video)
+        except (film.NoFilm, OSError) as error:
+            filmed = False
+            print(f"arm-companion sim: {error}", file=sys.stderr)
+    show_verdict(verdict, progress.console, files)
     if arguments.json:
         wall = time.perf_counter() - started
         print(json.dumps(_summary(verdict, result, wall)))
-    return 0 if verdict.success else 1
+    return 0 if verdict.success and filmed else 1
 
 
 def _trials(arguments: argparse.Namespace, config: Config) -> int:
@@ -176,20 +215,20 @@ def _record_path(arguments: argparse.Namespace) -> Path:
     return path
 
 
-def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments)))
+    return run_simulated(fly_simulated(config, progress.say, prepare, _record_path(arguments)))
 
 
-def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     words = _daemon_words(arguments)
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say, prepare))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:
