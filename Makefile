@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup demo test scenarios soak check bench format clean
+.PHONY: help setup demo test scenarios soak check bench docs deb format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -27,7 +27,7 @@ test: $(STAMP)  ## run the tests: what has its own time on all cores, then what 
 	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak'
 	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak'
 
-scenarios: $(STAMP)  ## fly the longer scenarios in simulated time
+scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and install the Debian package
 	@$(BIN)/python -m pytest -n auto --dist load -m scenario
 
 soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questions to the mechanics: none may go wrong
@@ -42,6 +42,13 @@ check: $(STAMP)  ## lint, format, types and dependency directions
 
 bench: $(STAMP)  ## measure speed as ratios beside peers; writes build/bench.json
 	@$(BIN)/python -m tests.bench
+
+docs: $(STAMP)  ## build the documentation in build/docs, and check its links
+	@$(BIN)/python -m sphinx -b html -q -W --keep-going docs build/docs
+	@echo "build/docs/index.html"
+
+deb:  ## build a Debian package of the daemon for this machine, in build
+	@systemd/deb.sh --output build
 
 format: $(STAMP)  ## apply the formatter and the safe fixes
 	@$(BIN)/ruff check --fix .

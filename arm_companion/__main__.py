@@ -4,6 +4,7 @@ import argparse
 import importlib
 import os
 import sys
+from collections.abc import Collection
 
 from arm_companion import __version__
 from arm_companion.errors import ArmError, ConfigError
@@ -18,27 +19,36 @@ _COMMANDS = {
     "jog": "bend the arm from the keyboard, while no daemon runs",
     "replay": "run a recorded flight through today's code, or ask what would have been",
     "report": "one page of a recorded flight, for people",
-    "config": "check or show a configuration",
+    "config": "check, show and explain a configuration",
     "doctor": "look at the whole installation, and say what to mend",
 }
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Parse the command line and run one command; returns the exit code."""
-    words = sys.argv[1:] if argv is None else argv
+def command_line(named: Collection[str] = tuple(_COMMANDS)) -> argparse.ArgumentParser:
+    """The parser of `arm-companion`.
+
+    Args:
+        named: commands whose options it knows; only their modules are imported, so that the daemon starts quickly.
+    """
     parser = argparse.ArgumentParser(
         prog="arm-companion", description="Companion-computer service for a continuum arm on a drone."
     )
     parser.add_argument("--version", action="version", version=f"arm-companion {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    named = next((word for word in words if not word.startswith("-")), None)
     for name, text in _COMMANDS.items():
         sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        if name == named:  # only the command that runs is imported: the daemon must start quickly
+        if name in named:
             module = importlib.import_module(f"arm_companion.cli.{name}")
             module.add_arguments(sub)
             sub.set_defaults(run=module.run)
-    arguments = parser.parse_args(words)
+    return parser
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Parse the command line and run one command; returns the exit code."""
+    words = sys.argv[1:] if argv is None else argv
+    named = next((word for word in words if not word.startswith("-")), "")
+    arguments = command_line([named]).parse_args(words)
     try:
         code: int = arguments.run(arguments)
         sys.stdout.flush()

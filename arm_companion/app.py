@@ -16,6 +16,7 @@ from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
@@ -103,6 +104,7 @@ class Daemon:
         *,
         compiled_model: bool = False,
         model: ArmModel | None = None,
+        computer: ComputerWatch | None = None,
         live: Address | None = None,
     ) -> None:
         check_flyable(config)
@@ -140,7 +142,8 @@ class Daemon:
         self.vehicle_check = VehicleCheck(
             autopilot_link, self._autopilot, config.vehicle, config.mavlink, self._component.notify
         )
-        self._telemetry = Telemetry(self._links, config.rates, clock)
+        self._computer = computer
+        self._telemetry = Telemetry(self._links, config.rates, clock, computer.message if computer else None)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
         self._onlookers = Onlookers(config, clock, self._component.commands, live)
         self._component.hearers.append(self._onlookers.notice)
@@ -184,6 +187,7 @@ class Daemon:
                 self._keys.run,
                 self._bus.run,
                 *self._onlookers.runs,
+                *(() if self._computer is None else (self._computer.run,)),
                 self._cycles,
             )
         finally:

@@ -33,7 +33,7 @@ _CODES: Final = """exit codes:
 
 _ORDERS: Final = {
     "ready": "torque on, pretension, straight",
-    "perch": "perch on the bar; ends when the grip is verified",
+    "perch": "perch on the bar; ends when the grip is verified, or when the vehicle hangs",
     "grasp": "grasp the object",
     "release": "let go and clear what was held",
     "stow": "straighten the arm",
@@ -65,6 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         order = add(name, text)
         if name == "perch":
             _bar(order)
+            order.add_argument(
+                "--hang", action="store_true", help="hang from the bar with idle motors, by an arm above the vehicle"
+            )
     _jog(add("jog", "bend the free arm from the keyboard or by numbers, or move the anchored vehicle"))
     control = add("control", "take primary control, so that other stations may only stow and abort, or give it up")
     control.add_argument("verb", choices=("take", "release", "take-over"))

@@ -20,6 +20,7 @@ from arm_companion.ground.jog import HELP, PERIOD_S, WATCHDOG_S, Jog, keyboard
 from arm_companion.ground.parameters import Parameter
 from arm_companion.ground.reports import Status
 from arm_companion.ground.texts import Text
+from arm_companion.protocol.dialect import mav
 
 _TARGET_S: Final = 1.5
 _FOLLOWS_S: Final = 2.0
@@ -132,6 +133,9 @@ def _order(name: str) -> Action:
             return await follow(arguments, arm, "ABORT", arm.abort(timeout=arguments.timeout))
         if name == "perch" and arguments.bar is not None:
             await _target(arguments, arm)
+        if name == "perch" and arguments.hang:
+            hang = arm.perch(mav.ARM_PERCH_KIND_HANG, progress=progress, timeout=arguments.timeout)
+            return await follow(arguments, arm, "PERCH", hang)
         method: Callable[..., Awaitable[None]] = getattr(arm, name)
         return await follow(arguments, arm, name.upper(), method(progress=progress, timeout=arguments.timeout))
 

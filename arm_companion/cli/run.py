@@ -4,11 +4,13 @@ import argparse
 import asyncio
 import logging
 import sys
+from pathlib import Path
 
 from arm_companion.app import Daemon, open_configured
 from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
-from arm_companion.drivers.settings import with_kept_changes
+from arm_companion.drivers.computer import ComputerWatch
+from arm_companion.drivers.settings import state_directory, with_kept_changes
 from arm_companion.drivers.standard_services import Power
 from arm_companion.supervisor import ServiceManager, stop_on_signals, take_priority
 
@@ -43,7 +45,11 @@ def run(arguments: argparse.Namespace) -> int:
         manager = ServiceManager()
         try:
             clock = Clock(asyncio.get_running_loop(), unix_now())
-            daemon = Daemon(config, open_configured(config), clock, manager, compiled_model=True, live=arguments.live)
+            computer = ComputerWatch(state_directory(config) or Path("/"))
+            openers = open_configured(config)
+            daemon = Daemon(
+                config, openers, clock, manager, compiled_model=True, computer=computer, live=arguments.live
+            )
             await daemon.run(stop)
             return START_AGAIN if daemon.power is Power.RESTART else 0
         finally:

@@ -15,7 +15,7 @@ from arm_companion.cli.common import add_config_arguments, add_live_argument, lo
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
-_SCENARIOS = ("perch", "world")
+_CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "world": "sim.toml"}
 _FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
@@ -23,10 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion sim`."""
     parser.add_argument(
         "scenario",
-        choices=_SCENARIOS,
-        help="perch: take off, wrap a bar, be pulled, let go, land; world: no script, your own ground station flies",
+        choices=tuple(_CONFIGS),
+        help="perch: take off, wrap a bar, be pulled, let go, land; hang: wrap a bar overhead, hang with idle motors, "
+        "let go, land; world: no script, your own ground station flies",
     )
-    add_config_arguments(parser, default="sim.toml")
+    add_config_arguments(parser, default="sim.toml, for hang sim_hang.toml")
+    parser.set_defaults(config=None)
     add_live_argument(parser)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
@@ -72,9 +74,9 @@ def _count(text: str) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the scenario; exit code 0 only when it perched and let go."""
-    if arguments.trials is not None and not (arguments.simulated and arguments.scenario == "perch"):
-        print("arm-companion sim: --trials flies the perch in simulated time: sim perch --simulated", file=sys.stderr)
+    """Fly the scenario; exit code 0 only when it perched, or hung, and let go."""
+    if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
+        print("arm-companion sim: --trials flies in simulated time: sim perch|hang --simulated", file=sys.stderr)
         return 2
     if arguments.live is not None and arguments.simulated:
         print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
@@ -82,6 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.video is not None and (why := _no_video(arguments)):
         print(f"arm-companion sim: --video {why}", file=sys.stderr)
         return 2
+    arguments.config = arguments.config or _CONFIGS[arguments.scenario]
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
@@ -97,8 +100,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _no_video(arguments: argparse.Namespace) -> str:
     """Why there can be no film whatever is installed; empty: there can."""
-    if arguments.scenario != "perch" or arguments.trials is not None:
-        return "films one flight: sim perch without --trials"
+    if arguments.scenario == "world" or arguments.trials is not None:
+        return "films one flight: sim perch or hang, without --trials"
     if arguments.video.suffix not in _FILMS:
         return f"{arguments.video}: a film's name ends with one of {', '.join(_FILMS)}"
     return ""
@@ -127,8 +130,8 @@ def _serve(arguments: argparse.Namespace, config: Config) -> int:
 def _fly(arguments: argparse.Namespace, config: Config) -> int:
     from arm_companion.sim import film  # noqa: PLC0415 - after the check for the extra
     from arm_companion.sim.figure import draw  # noqa: PLC0415
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.progress import Progress, show_verdict  # noqa: PLC0415
-    from arm_companion.sim.verdict import judge  # noqa: PLC0415
     from arm_companion.sim.world import World  # noqa: PLC0415
 
     output: Path = arguments.output
@@ -149,9 +152,10 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
-    verdict = judge(result.flight, result.failure)
-    figure = output / "perch.png"
-    draw(result.flight, config, f"Anchor perch: {verdict.verdict}", figure)
+    scenario = SCENARIOS[arguments.scenario]
+    verdict = scenario.judge(result.flight, result.failure, config)
+    figure = output / f"{arguments.scenario}.png"
+    draw(result.flight, config, f"{scenario.title}: {verdict.verdict}", figure)
     log = output / "events.log"
     start = result.flight.samples[0].t if result.flight.samples else 0.0
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
@@ -166,28 +170,35 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
         except (film.NoFilm, OSError) as error:
             filmed = False
             print(f"arm-companion sim: {error}", file=sys.stderr)
-    show_verdict(verdict, progress.console, files)
+    show_verdict(scenario.title, verdict, progress.console, files)
     if arguments.json:
         wall = time.perf_counter() - started
-        print(json.dumps(_summary(verdict, result, wall)))
+        print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
     return 0 if verdict.success and filmed else 1
 
 
 def _trials(arguments: argparse.Namespace, config: Config) -> int:
-    from arm_companion.sim.progress import show_outcome, show_summary  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.progress import show_outcome, show_summary  # noqa: PLC0415
     from arm_companion.sim.trials import fly  # noqa: PLC0415
 
     started = time.perf_counter()
     stream = sys.stderr if arguments.json else sys.stdout
     seeds = range(config.sim.seed, config.sim.seed + arguments.trials)
+    scenario = SCENARIOS[arguments.scenario]
     summary = fly(
-        arguments.config, arguments.settings, seeds, arguments.jobs, lambda outcome: show_outcome(outcome, stream)
+        arguments.config,
+        arguments.settings,
+        seeds,
+        arguments.jobs,
+        lambda outcome: show_outcome(outcome, scenario.done, stream),
+        arguments.scenario,
     )
-    show_summary(summary, stream)
+    show_summary(scenario.title, scenario.done, summary, stream)
     if arguments.json:
         low, high = summary.interval
         contract = {
-            "scenario": "perch",
+            "scenario": arguments.scenario,
             "success": summary.success,
             "trials": len(summary.outcomes),
             "failures": summary.failures,
@@ -217,18 +228,22 @@ def _record_path(arguments: argparse.Namespace) -> Path:
 
 def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    return run_simulated(fly_simulated(config, progress.say, prepare, _record_path(arguments)))
+    fly = SCENARIOS[arguments.scenario].fly
+    return run_simulated(fly_simulated(config, progress.say, prepare, _record_path(arguments), fly=fly))
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
-    words = _daemon_words(arguments)
+    words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say, prepare))
+        log = arguments.output / "daemon.log"
+        return runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:
@@ -241,13 +256,13 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
     return words
 
 
-def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
+def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
-    perched = next((w for w in verdict.wrench if w.span == "perched"), None)
+    perched = next((w for w in verdict.wrench if w.span in ("perched", "hanging")), None)
     errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
     return {
-        "scenario": "perch",
+        "scenario": scenario,
         "verdict": verdict.verdict,
         "reason": verdict.reason,
         "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],

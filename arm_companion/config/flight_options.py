@@ -123,6 +123,7 @@ class RatesConfig:
     wrench_hz: float = option("ARM_REACTION_WRENCH", 20.0, unit="Hz", lower=0.0, upper=200.0)
     stiffness_hz: float = option("ARM_STIFFNESS", 1.0, unit="Hz", lower=0.0, upper=20.0)
     payload_hz: float = option("ARM_PAYLOAD, while one is estimated", 1.0, unit="Hz", lower=0.0, upper=50.0)
+    computer_hz: float = option("ONBOARD_COMPUTER_STATUS", 0.2, unit="Hz", lower=0.0, upper=1.0)
     mirrors_hz: float = option("NAMED_VALUE_FLOAT and DEBUG_FLOAT_ARRAY", 1.0, unit="Hz", lower=0.0, upper=20.0)
 
 

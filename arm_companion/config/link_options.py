@@ -35,6 +35,7 @@ STREAMED = (
     "NAMED_VALUE_FLOAT",
     "DEBUG_FLOAT_ARRAY",
     "LINK_NODE_STATUS",
+    "ONBOARD_COMPUTER_STATUS",
 )
 """Messages with a rate of their own on each link."""
 

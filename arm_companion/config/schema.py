@@ -23,6 +23,7 @@ from arm_companion.config.flight_options import (
     SimBarConfig,
     SimConfig,
 )
+from arm_companion.config.hang_options import HangConfig
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.config.mqtt_options import MqttConfig
 from arm_companion.config.options import section
@@ -38,6 +39,7 @@ __all__ = [
     "BackboneConfig",
     "CalibrationConfig",
     "Config",
+    "HangConfig",
     "LimitsConfig",
     "LinkConfig",
     "MavlinkConfig",
@@ -68,6 +70,7 @@ class Config:
     calibration: CalibrationConfig = section(CalibrationConfig)
     limits: LimitsConfig = section(LimitsConfig)
     perch: PerchConfig = section(PerchConfig)
+    hang: HangConfig = section(HangConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)

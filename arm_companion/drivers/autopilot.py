@@ -27,9 +27,11 @@ HEARTBEAT: Final = mav.MAVLINK_MSG_ID_HEARTBEAT
 ATTITUDE: Final = mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 POSITION: Final = mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED
 LANDED: Final = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
+THROTTLE: Final = mav.MAVLINK_MSG_ID_VFR_HUD
 ACK: Final = mav.MAVLINK_MSG_ID_COMMAND_ACK
 
 LANDED_RATE_HZ: Final = 5.0
+THROTTLE_RATE_HZ: Final = 10.0
 CHECK_PERIOD_S: Final = 1.0
 """How often the arriving rates are held against the asked ones."""
 
@@ -85,6 +87,7 @@ class Autopilot:
             ATTITUDE: vehicle.state_rate_hz,
             POSITION: vehicle.state_rate_hz,
             LANDED: LANDED_RATE_HZ,
+            THROTTLE: THROTTLE_RATE_HZ,
         }
         self._arrived = dict.fromkeys(self._rates, 0)
         self._slow = dict.fromkeys(self._rates, (False, 0))  # nothing came, and checks in a row that it was so little
@@ -95,7 +98,7 @@ class Autopilot:
         self._check_now = asyncio.Event()
         self._mismatch_told = False
         self._reset()
-        link.subscribe(self._on_message, (HEARTBEAT, ATTITUDE, POSITION, LANDED, ACK))
+        link.subscribe(self._on_message, (HEARTBEAT, ATTITUDE, POSITION, LANDED, THROTTLE, ACK))
 
     def _reset(self) -> None:
         self._heartbeat: Message | None = None
@@ -105,6 +108,7 @@ class Autopilot:
         self._position: Vec3 = (0.0, 0.0, 0.0)
         self._velocity: Vec3 = (0.0, 0.0, 0.0)
         self._landed = True
+        self._throttle, self._throttle_at = 0.0, float("-inf")
 
     @property
     def system_id(self) -> int:
@@ -136,6 +140,8 @@ class Autopilot:
             heartbeat_age_s=now - self._heartbeat_at,
             position_age_s=now - self._position_at,
             attitude_age_s=now - self._attitude_at,
+            throttle=self._throttle,
+            throttle_age_s=now - self._throttle_at,
             clock_error_s=float("inf") if self._timesync is None else self._timesync.error_s,
         )
 
@@ -235,6 +241,9 @@ class Autopilot:
                 self._arrived[LANDED] += 1
                 if message.landed_state != mav.MAV_LANDED_STATE_UNDEFINED:
                     self._landed = message.landed_state == mav.MAV_LANDED_STATE_ON_GROUND
+            case mav.MAVLINK_MSG_ID_VFR_HUD:
+                self._arrived[THROTTLE] += 1
+                self._throttle, self._throttle_at = message.throttle / 100.0, now
             case mav.MAVLINK_MSG_ID_COMMAND_ACK:
                 self._on_ack(message)
 

@@ -136,9 +136,7 @@ def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
     """
     match order.name:
         case "PERCH":
-            if (kind := _PERCH_KIND.read(command)) != ANCHOR:
-                raise CommandRejected("only the anchor perch (param1 = 0) is available")
-            return (kind,)
+            return (_PERCH_KIND.read(command),)
         case "JOG":
             kind = _JOG_KIND.read(command)
             if kind == JOG_BEND:

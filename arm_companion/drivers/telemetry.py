@@ -33,6 +33,7 @@ PAYLOAD: Final = mav.MAVLINK_MSG_ID_ARM_PAYLOAD
 VALUES: Final = mav.MAVLINK_MSG_ID_NAMED_VALUE_FLOAT
 ARRAY: Final = mav.MAVLINK_MSG_ID_DEBUG_FLOAT_ARRAY
 NODE: Final = mav.MAVLINK_MSG_ID_LINK_NODE_STATUS
+COMPUTER: Final = mav.MAVLINK_MSG_ID_ONBOARD_COMPUTER_STATUS
 
 PER_MESSAGE: Final = 4
 """Tendons that fit into one ARM_TENDONS."""
@@ -70,11 +71,19 @@ class Telemetry:
         links: all links; each has its own rates, which SET_MESSAGE_INTERVAL changes.
         rates: rates at the start.
         clock: Unix time of the stamps.
+        computer: makes ONBOARD_COMPUTER_STATUS for a stamp; None: nobody watches the computer.
     """
 
-    def __init__(self, links: Sequence[MavlinkLink], rates: RatesConfig, clock: Clock) -> None:
+    def __init__(
+        self,
+        links: Sequence[MavlinkLink],
+        rates: RatesConfig,
+        clock: Clock,
+        computer: Callable[[int], Message] | None = None,
+    ) -> None:
         self._links = links
         self._clock = clock
+        self._computer = computer
         self.holder: tuple[int, int] = (0, 0)
         """Who has primary control, for ARM_STATUS."""
         self._nodes = {link.name: LinkWatch(link) for link in links}
@@ -123,6 +132,8 @@ class Telemetry:
             self._offer(PAYLOAD, now, lambda: iter((payload_message(stamp, payload),)))
         self._offer(VALUES, now, lambda: mirror_values(boot_ms, status, tendons, wrench))
         self._offer(ARRAY, now, lambda: iter((mirror_array(stamp, status, tendons, wrench),)))
+        if (computer := self._computer) is not None:
+            self._offer(COMPUTER, now, lambda: iter((computer(stamp),)))
         for link in self._links:
             if link.connected and link.streams.take_due(NODE, now):
                 link.send(self._nodes[link.name].message(stamp, now), Priority.BULK)
@@ -148,6 +159,7 @@ def _rates(rates: RatesConfig, link: MavlinkLink) -> Iterator[tuple[int, float]]
         (VALUES, mirrors),
         (ARRAY, mirrors),
         (NODE, 0.0),
+        (COMPUTER, rates.computer_hz),
     ):
         yield id_, link.config.rates_hz.get(mav.mavlink_map[id_].msgname, rate)
 

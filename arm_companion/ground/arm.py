@@ -24,7 +24,7 @@ _KEPT: Final = 200
 _GOALS: Final = {
     mav.MAV_CMD_ARM_READY: ("READY",),
     mav.MAV_CMD_ARM_STOW: ("STOWED",),
-    mav.MAV_CMD_ARM_PERCH: ("PERCHED",),
+    mav.MAV_CMD_ARM_PERCH: ("PERCHED", "HANGING"),
     mav.MAV_CMD_ARM_RELEASE: ("STOWED",),
 }
 """States that end a command; ARM_STATUS tells of them when the final answer gets lost."""
@@ -202,7 +202,7 @@ class Arm:
         progress: Progress | None = None,
         timeout: float | None = None,  # noqa: ASYNC109
     ) -> None:
-        """Perch on the bar; ends when the grip is verified."""
+        """Perch on the bar; ends when the grip is verified, or with ARM_PERCH_KIND_HANG when the vehicle hangs."""
         await self.order(mav.MAV_CMD_ARM_PERCH, kind, progress=progress, timeout=timeout)
 
     async def grasp(self, progress: Progress | None = None, timeout: float | None = None) -> None:  # noqa: ASYNC109

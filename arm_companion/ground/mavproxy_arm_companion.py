@@ -23,20 +23,21 @@ NAME: Final = "arm_companion.ground.mavproxy_arm_companion"
 """As it is loaded, so that it can be unloaded by the same name."""
 COMPONENT: Final = 192
 SILENT_S: Final = 5.0
-USAGE: Final = """usage: armc status|ready|perch|grasp|release|stow|abort|clear
+USAGE: Final = """usage: armc status|ready|perch|hang|grasp|release|stow|abort|clear
        armc jog THETA_DEG [DELTA_DEG]   bend the free arm
        armc vehicle N E D               move the anchored vehicle, m
        armc control take|release|take-over
        armc component [ID]              component id of the arm"""
 
 _ORDERS: Final = {
-    "ready": mav.MAV_CMD_ARM_READY,
-    "perch": mav.MAV_CMD_ARM_PERCH,
-    "grasp": mav.MAV_CMD_ARM_GRASP,
-    "release": mav.MAV_CMD_ARM_RELEASE,
-    "stow": mav.MAV_CMD_ARM_STOW,
-    "abort": mav.MAV_CMD_ARM_ABORT,
-    "clear": mav.MAV_CMD_ARM_CLEAR_ERRORS,
+    "ready": (mav.MAV_CMD_ARM_READY,),
+    "perch": (mav.MAV_CMD_ARM_PERCH,),
+    "hang": (mav.MAV_CMD_ARM_PERCH, mav.ARM_PERCH_KIND_HANG),
+    "grasp": (mav.MAV_CMD_ARM_GRASP,),
+    "release": (mav.MAV_CMD_ARM_RELEASE,),
+    "stow": (mav.MAV_CMD_ARM_STOW,),
+    "abort": (mav.MAV_CMD_ARM_ABORT,),
+    "clear": (mav.MAV_CMD_ARM_CLEAR_ERRORS,),
 }
 _CONTROL: Final = {
     "release": mav.ARM_CONTROL_RELEASE,
@@ -81,7 +82,7 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
         verb, *rest = words or ["help"]
         try:
             if verb in _ORDERS and not rest:
-                self._order(_ORDERS[verb])
+                self._order(*_ORDERS[verb])
             elif verb == "status" and not rest:
                 print(self.describe())
             elif verb == "jog" and len(rest) in (1, 2):

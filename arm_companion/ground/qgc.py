@@ -8,6 +8,7 @@ from arm_companion.protocol.dialect import mav
 _BUTTONS: Final = (
     ("Arm: ready", mav.MAV_CMD_ARM_READY, ()),
     ("Arm: perch", mav.MAV_CMD_ARM_PERCH, (mav.ARM_PERCH_KIND_ANCHOR,)),
+    ("Arm: hang", mav.MAV_CMD_ARM_PERCH, (mav.ARM_PERCH_KIND_HANG,)),
     ("Arm: grasp", mav.MAV_CMD_ARM_GRASP, ()),
     ("Arm: release", mav.MAV_CMD_ARM_RELEASE, ()),
     ("Arm: stow", mav.MAV_CMD_ARM_STOW, ()),

@@ -8,6 +8,7 @@ import numpy as np
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
+from arm_companion.mission.load import CARRYING, SHARING, begin, hung_reference, share_on, unloading
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
@@ -22,10 +23,10 @@ from arm_companion.mission.motion import (
     yaw_of,
 )
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Phase, State
+from arm_companion.mission.state import PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
 
-_PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING})
+_PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | CARRYING
 _REFERENCE_RESTS = frozenset(
     {
         Phase.READYING,
@@ -33,6 +34,7 @@ _REFERENCE_RESTS = frozenset(
         Phase.STOWING,
         Phase.STOWED,
         Phase.HOLDING,
+        Phase.HANG_HOLD,
     }
 )
 _ORDER_OF_PERCH = (
@@ -43,7 +45,9 @@ _ORDER_OF_PERCH = (
     Phase.VERIFY,
     Phase.PERCHED,
 )
+_ORDER_OF_HANG = (*_ORDER_OF_PERCH[:-1], Phase.LOAD_TRANSFER, Phase.HANGING)
 _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
+_ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
@@ -61,6 +65,10 @@ _TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that 
 
 def prepare(s: Situation) -> State:
     """Memory at the entry of the present phase."""
+    return begin(s) if s.state.phase in CARRYING else _prepare(s)
+
+
+def _prepare(s: Situation) -> State:
     state = s.state
     match state.phase:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
@@ -74,6 +82,7 @@ def prepare(s: Situation) -> State:
                 state,
                 heading=s.heading_to_bar(),
                 anchor=None,
+                rest=None,
                 offset=ZERO,
                 reference=state.reference or _here(s),
             )
@@ -106,7 +115,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     Returns:
         Memory, what the servos do, and their goals (m of tendon taken in) when they are driven.
     """
-    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s)))
+    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s), load=share_on(s)))
     state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
@@ -167,7 +176,9 @@ def setpoint(s: Situation) -> Setpoint | None:
 
 def progress(s: Situation) -> int:
     """Per cent of the running order, from the phases passed."""
-    for order in (_ORDER_OF_PERCH, _ORDER_OF_RELEASE):
+    hangs = s.state.kind is PerchKind.HANG
+    there, back = (_ORDER_OF_HANG, _ORDER_OF_LEAVING) if hangs else (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
+    for order in (there, back):
         if s.state.phase in order:
             return round(100 * order.index(s.state.phase) / (len(order) - 1))
     return 100 if s.state.phase is Phase.READY else 0
@@ -195,6 +206,10 @@ def _reference(s: Situation) -> Reference | None:
     if state.phase in _REFERENCE_RESTS:
         if astray(s) is not None:
             return _here(s)  # a vehicle that follows again stays where it is
+        return dataclasses.replace(reference, velocity=ZERO)
+    if state.phase in SHARING:
+        return hung_reference(s, reference)
+    if state.phase is Phase.RELEASE and state.contact_w == ZERO:  # after a restart nobody knows where the bar was met
         return dataclasses.replace(reference, velocity=ZERO)
     if state.phase in (Phase.WRAP, Phase.RELEASE):
         return Reference(_beside_bar(s), ZERO, state.heading)
@@ -282,6 +297,8 @@ def _rest(s: Situation) -> Vec3 | None:
 
 def _lean(s: Situation) -> Vec3:
     """The acceleration fed forward, moved towards what the prediction asks for; zero where it asks for nothing."""
+    if s.state.phase in SHARING and s.external and s.vehicle_fresh:
+        return unloading(s)
     prediction = s.state.prediction
     wanted = ZERO
     if s.state.phase is Phase.PERCHED and s.state.feedforward and prediction is not None:

@@ -1,12 +1,12 @@
-"""Writes the generated diagram of the perch: `python -m arm_companion.mission.diagram > docs/perch_states.md`."""
+"""Writes the generated diagram of the perches: `python -m arm_companion.mission.diagram > docs/perch_states.md`."""
 
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.state import Phase
 
-HEADER = """# States of the anchor perch
+HEADER = """# States of the perches
 
-Made from the transition table in `arm_companion/mission/perch.py`; a test fails when the two differ.
+Made from the transition table in `arm_companion/mission/perch.py` and `hang.py`; a test fails when the two differ.
 Aborts are marked ✗. Rows are tried from the table's top, so aborts win over progress.
 
 """

@@ -37,6 +37,8 @@ class VehicleState:
     heartbeat_age_s: float = float("inf")
     position_age_s: float = float("inf")
     attitude_age_s: float = float("inf")
+    throttle: float = 0.0  # share of full throttle that the motors are asked for together
+    throttle_age_s: float = float("inf")
     clock_error_s: float = float("inf")  # greatest error of the ages, by TIMESYNC; inf: they count from the arrival
 
 

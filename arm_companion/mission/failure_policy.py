@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import hazards, perch
+from arm_companion.mission import hang, hazards, perch
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -22,6 +22,7 @@ SITUATIONS: dict[str, tuple[Phase, ...]] = {
     "free flight": (Phase.APPROACH, Phase.REACH, Phase.DEPART),
     "in contact": (Phase.CONTACT, Phase.WRAP, Phase.RELEASE),
     "anchored": (Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
+    "hanging": (Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK, Phase.HANG_HOLD),
     "holding": (Phase.HOLDING,),
 }
 """Phases by what lies between arm, bar and vehicle. On the ground or in the air, an arm at rest does the same."""
@@ -62,7 +63,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "pilot takes the mode",
         ArmFault.PILOT_TOOK_OVER,
-        (hazards.pilot_takes_over,),
+        (hazards.pilot_takes_over, hang.taken_from_us),
         "no set-points; goes on with the arm alone",
     ),
     Cause(
@@ -127,10 +128,15 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "contact lost",
         ArmFault.CONTACT_LOST,
-        (perch.no_grip, perch.pull_test_failed, hazards.grip_lost),
+        (perch.no_grip, perch.pull_test_failed, hazards.grip_lost, hang.slips),
         "cannot be told from letting go; a free arm has none",
     ),
-    Cause("slip", ArmFault.SLIP, (hazards.grip_lost,), "not judged: the vehicle is not asked to stay, or not held yet"),
+    Cause(
+        "slip",
+        ArmFault.SLIP,
+        (hazards.grip_lost, hang.slips),
+        "not judged: the vehicle is not asked to stay, or not held yet",
+    ),
     Cause("no contact in time", ArmFault.NO_CONTACT, (perch.no_contact,), "does not apply"),
     Cause(
         "stiffness test failed",
@@ -142,9 +148,15 @@ CAUSES: tuple[Cause, ...] = (
         "wrench over its limit",
         ArmFault.WRENCH_LIMIT,
         (hazards.wrench_over_limit,),
-        "goes on: the arm is free, or it is letting go, or its wrench is not known",
+        "goes on: the arm is free, or it is letting go, or its load is being taken back, or its wrench is not known",
     ),
     Cause("model has no solution", ArmFault.MODEL, (hazards.model_blind,), "nothing: ARM_REACTION_WRENCH is not valid"),
+    Cause(
+        "throttle not told",
+        ArmFault.VEHICLE_STATE_STALE,
+        (hang.throttle_lost,),
+        "nothing: nobody needs it; a hang perch is not begun; a load counts as taken back when the vehicle rises",
+    ),
     Cause(
         "set-points not followed",
         ArmFault.SETPOINT_REJECTED,
@@ -225,7 +237,7 @@ def cell(cause: Cause, situation: str) -> str:
 
 _HEADER = """# What happens when things go wrong
 
-Made from the tables in `arm_companion/mission/perch.py` and `notices.py`; a test fails when the two differ.
+Made from the tables in `arm_companion/mission/perch.py`, `hang.py` and `notices.py`; a test fails when the two differ.
 
 - `→` names the state that follows, in the same cycle. Every change is told as STATUSTEXT with its reason, and a
   command that is running is answered with FAILED.
@@ -234,8 +246,10 @@ Made from the tables in `arm_companion/mission/perch.py` and `notices.py`; a tes
 - The pilot always wins: set-points stop in the cycle in which another mode is seen, in every state.
 - A grip that is tested is given up only by a person, by a limit that breaks (tension, wrench), or when it slips: a
   vehicle that hangs on an arm with a dead servo is better off than one that falls.
-- Hanging (arm above, motors idle) and carrying (a grasped object) do not exist in this version, so they have no
-  columns.
+- An arm that may carry a vehicle whose motors idle or stand never opens. What goes wrong with it brings the motors up
+  (TAKE_BACK), if the vehicle is ours; if it is not, the arm holds (HANG_HOLD) until a person has the motors carry it.
+- An arm above that is found or left HOLDING goes on to HANG_HOLD at once.
+- Carrying (a grasped object) does not exist in this version, so it has no column.
 
 """
 

@@ -20,11 +20,12 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
+from arm_companion.mission.load import keep_load
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, Prediction, Running, State
+from arm_companion.mission.state import PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.vigil import keep_vigil
 from arm_companion.mission.wrench import predict
@@ -105,6 +106,7 @@ def _estimate(s: Situation) -> State:
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
         watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
+        load=keep_load(s),
     )
 
 
@@ -118,12 +120,14 @@ def _yield_to_pilot(s: Situation, notices: list[Notice]) -> Situation:
 
 def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[Notice]) -> Situation:
     """Carry out one order, or reject it and change nothing."""
-    name, phase = request.order.name, s.state.phase
+    name, phase, asked = request.order.name, s.state.phase, s
     try:
+        if request.order is Order.PERCH:
+            asked = s.remembering(dataclasses.replace(s.state, kind=_kind(request)))
         row = TABLE.order(request.order, phase)
         if row is None:
             raise CommandRejected(f"{name} is not possible in state {phase.name}")
-        if (reason := row.refusal(s)) is not None:
+        if (reason := row.refusal(asked)) is not None:
             raise CommandRejected(reason)
         jogged = jog(s, request) if request.order is Order.JOG else s.state
     except CommandRejected as rejected:
@@ -152,12 +156,17 @@ def _settle(state: State, request: Request) -> State:
         case Order.READY:
             return dataclasses.replace(state, streaming=True, errors=ArmFault.NONE)
         case Order.PERCH:
-            return dataclasses.replace(state, errors=ArmFault.NONE)
+            return dataclasses.replace(state, errors=ArmFault.NONE, kind=_kind(request))
         case Order.CLEAR_ERRORS:  # a person has looked at the tendons
             return dataclasses.replace(state, errors=ArmFault.NONE, watch=())
         case Order.FEEDFORWARD:
             return dataclasses.replace(state, feedforward=bool(request.parameters[0]))
     return state
+
+
+def _kind(request: Request) -> PerchKind:
+    """Which perch a PERCH asks for."""
+    return PerchKind(int(request.parameters[0])) if request.parameters else PerchKind.ANCHOR
 
 
 def _begins_clearing(s: Situation) -> bool:

@@ -3,6 +3,7 @@
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
+from arm_companion.mission import hang
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -25,7 +26,7 @@ from arm_companion.mission.hazards import (
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, dot, norm, scale, sub
 from arm_companion.mission.situation import Situation, at
-from arm_companion.mission.state import FOLLOWS, Phase
+from arm_companion.mission.state import FOLLOWS, PerchKind, Phase
 
 Row = Transition[Phase, Situation]
 
@@ -180,6 +181,11 @@ def pull_test_passed(s: Situation) -> str | None:
     return f"pull test passed: gave {share:.0%} of the asked move"
 
 
+def tested_to_hang(s: Situation) -> str | None:
+    """The grip is good, and the vehicle shall hang by it."""
+    return pull_test_passed(s) if s.state.kind is PerchKind.HANG else None
+
+
 def unloaded(s: Situation) -> str | None:
     """The reference is back where the vehicle rests and nothing is fed forward: letting go does not kick."""
     reference = s.state.reference
@@ -194,8 +200,12 @@ def unwrapped(s: Situation) -> str | None:
 
 
 def cannot_depart(s: Situation) -> str | None:
-    """The arm is clear but the vehicle is not ours to move."""
-    return "arm clear; the vehicle is not ours to move" if unwrapped(s) and not s.external else None
+    """The arm is clear but the vehicle is not ours to move, or nobody knows any more where the bar was met."""
+    if not unwrapped(s):
+        return None
+    if not s.external:
+        return "arm clear; the vehicle is not ours to move"
+    return "arm clear; where the bar was met is not known" if s.state.contact_w == ZERO else None
 
 
 # --- orders: what a person may ask, and when ---
@@ -223,6 +233,8 @@ def cannot_perch(s: Situation) -> str | None:
         return f"the bar is {distance:.0f} m away; at most {_BAR_WITHIN_M:g} m are allowed"
     if abs(s.bar.axis_w[2]) > _BAR_LEVEL:
         return "the bar is not level"
+    if s.state.kind is PerchKind.HANG and (reason := hang.cannot_hang(s)) is not None:
+        return reason
     return hot(s) or low_voltage(s)
 
 
@@ -243,11 +255,11 @@ ORDERS: tuple[Ask, ...] = (
         cannot_ready,
     ),
     Ask(Order.READY, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY}), cannot_ready),
-    Ask(Order.PERCH, frozenset({Phase.READY}), Phase.APPROACH, frozenset({Phase.PERCHED}), cannot_perch),
+    Ask(Order.PERCH, frozenset({Phase.READY}), Phase.APPROACH, frozenset({Phase.PERCHED, Phase.HANGING}), cannot_perch),
     Ask(Order.JOG, frozenset({Phase.PERCHED}), Phase.PERCHED, frozenset({Phase.PERCHED}), cannot_jog_vehicle),
     Ask(Order.JOG, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY})),
     Ask(Order.RELEASE, GRASPING | GRIPPED, Phase.UNLOAD, STOWED_ONLY),
-    Ask(Order.RELEASE, frozenset({Phase.HOLDING}), Phase.RELEASE, STOWED_ONLY),
+    Ask(Order.RELEASE, frozenset({Phase.HOLDING}), Phase.RELEASE, STOWED_ONLY, hang.cannot_open),
     Ask(Order.STOW, FREE_FLIGHT, Phase.DEPART, STOWED_ONLY),
     Ask(Order.STOW, frozenset({Phase.READYING, Phase.READY, Phase.STOWING}), Phase.STOWING, STOWED_ONLY),
     Ask(Order.STOW, STOWED_ONLY, Phase.STOWED, STOWED_ONLY),
@@ -269,6 +281,7 @@ ORDERS: tuple[Ask, ...] = (
             Phase.STARTUP,
         )
     ),
+    *hang.ORDERS,
 )
 
 _ENDS_A_BEGINNING = ((FREE_FLIGHT, Phase.DEPART), (GRASPING | {Phase.VERIFY}, Phase.UNLOAD))
@@ -300,6 +313,7 @@ TABLE: Table[Phase, Situation] = Table(
             ArmFault.DISARMED,
         ),
         Row(frozenset({Phase.RELEASE}), motors_stopped, Phase.HOLDING, "motors stop", ArmFault.DISARMED),
+        *hang.ABORTS,
         # then where it is: a jump moves all that is remembered, so a grip that is tested already stays
         Row(
             FREE_FLIGHT | {Phase.DEPART},
@@ -346,6 +360,8 @@ TABLE: Table[Phase, Situation] = Table(
             ArmFault.TIMEOUT,
         ),
         # progress
+        *hang.PROGRESS,
+        Row(frozenset({Phase.VERIFY}), tested_to_hang, Phase.LOAD_TRANSFER, "pull test passed, to hang"),
         Row(frozenset({Phase.STARTUP}), straight_at_start, Phase.STOWED, "arm at rest"),
         Row(frozenset({Phase.STARTUP}), bent_at_start, Phase.HOLDING, "arm holds something", ArmFault.RESTARTED),
         Row(frozenset({Phase.READYING}), pose_checked, Phase.READY, "pose checked"),
@@ -369,6 +385,7 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.DEPART}), at_standoff, Phase.STOWING, "at stand-off"),
         Row(frozenset({Phase.STOWING}), pose_checked, Phase.STOWED, "arm straight"),
         # time limits last: progress in the same cycle wins
+        *hang.LIMITS,
         Row(frozenset({Phase.APPROACH}), state_timeout, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
         Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),

@@ -4,6 +4,7 @@ import math
 
 from arm_companion.mission import actions, hazards
 from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
+from arm_companion.mission.load import SHARING
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction
@@ -16,6 +17,7 @@ _BEHAVIOUR = {
     Phase.READY: "ready",
     Phase.STOWING: "stow",
     Phase.HOLDING: "hold",
+    Phase.HANG_HOLD: "hold",
 }
 
 
@@ -53,8 +55,9 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.FEEDFORWARD: state.lean != ZERO
         or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
         ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
-        ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
-        ArmFlag.ANCHORED: state.phase is Phase.PERCHED,
+        ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD)
+        or state.phase in SHARING,
+        ArmFlag.ANCHORED: state.phase in (Phase.PERCHED, Phase.HANGING),
     }
     return ArmFlag(sum(flag.value for flag, holds in held.items() if holds))
 

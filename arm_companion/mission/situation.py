@@ -16,6 +16,7 @@ from arm_companion.mission.facts import Bar, Control, Facts, Vec3
 from arm_companion.mission.motion import ZERO, add, dot, norm, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, State
 
+_ABOVE = -0.5  # z of the arm's base axis in body axes
 _FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
 
 
@@ -103,6 +104,11 @@ class Situation:
         return x, y, z
 
     # --- the arm ---
+
+    @property
+    def arm_above(self) -> bool:
+        """Whether the arm points up from the vehicle, so that the vehicle can hang by it."""
+        return float(self.mount.rotation[2, 2]) < _ABOVE
 
     @property
     def pulls(self) -> tuple[float, ...]:

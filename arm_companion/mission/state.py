@@ -12,7 +12,7 @@ from arm_companion.record_codec import UNRECORDED
 
 
 class Phase(enum.Enum):
-    """States of the anchor perch, in the order of a flight; the value is the number of ARM_STATE."""
+    """States of the perches, in the order of a flight; the value is the number of ARM_STATE."""
 
     STARTUP = 0
     STOWED = 1
@@ -29,6 +29,10 @@ class Phase(enum.Enum):
     DEPART = 12
     STOWING = 13
     HOLDING = 14
+    LOAD_TRANSFER = 15
+    HANGING = 22
+    TAKE_BACK = 23
+    HANG_HOLD = 24
 
 
 MOVES_VEHICLE = frozenset(
@@ -42,6 +46,9 @@ MOVES_VEHICLE = frozenset(
         Phase.UNLOAD,
         Phase.RELEASE,
         Phase.DEPART,
+        Phase.LOAD_TRANSFER,
+        Phase.HANGING,
+        Phase.TAKE_BACK,
     }
 )
 """Phases whose set-points the vehicle must follow."""
@@ -127,6 +134,38 @@ class Vigil:
     leap_m: float = 0.0
 
 
+class PerchKind(enum.Enum):
+    """How the vehicle perches, ARM_PERCH_KIND."""
+
+    ANCHOR = 0
+    HANG = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """How arm and motors share the vehicle's weight while it hangs, or is about to.
+
+    Attributes:
+        hover: throttle of the free hover, share of full; 0: not known.
+        share: of the hover's thrust that is asked for now; 1 hovers.
+        step: the share that the present step goes to.
+        trim: acceleration that makes the measured throttle the asked one, m/s^2 down.
+        rested_s: for how long the vehicle has been at rest in this step.
+        carried_s: for how long the motors have carried the vehicle again.
+        place: of the vehicle, m, followed slowly: a slip is a fast move away from it.
+        first: height of the vehicle when the load began to move, m, NED.
+    """
+
+    hover: float = 0.0
+    share: float = 1.0
+    step: float = 1.0
+    trim: float = 0.0
+    rested_s: float = 0.0
+    carried_s: float = 0.0
+    place: Vec3 = ZERO
+    first: float = 0.0
+
+
 @dataclass(frozen=True, slots=True)
 class State:
     """Memory of the mission: plain values, so that a record holds all of it."""
@@ -156,5 +195,7 @@ class State:
     prediction: Prediction | None = None
     lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now
     offset: Vec3 = ZERO  # m, asked move away from the anchor
+    kind: PerchKind = PerchKind.ANCHOR  # of the perch ordered last
+    load: Load = Load()
     errors: ArmFault = ArmFault.NONE  # latched until the next READY or PERCH
     warned: frozenset[str] = frozenset()  # notices already given in this phase

@@ -91,6 +91,7 @@ def _move_frame(s: Situation, leap: Vec3) -> State:
         contact_w=add(state.contact_w, leap),
         position=add(state.position, leap),
         anchor=None if anchor is None else replace(anchor, position_w=add(anchor.position_w, leap)),
+        load=replace(state.load, place=add(state.load.place, leap), first=state.load.first + leap[2]),
         rest=None if state.rest is None else add(state.rest, leap),
         vigil=replace(state.vigil, shift=shift, jumped_at=s.t, leap_m=norm(leap)),
     )

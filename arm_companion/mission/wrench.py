@@ -15,13 +15,15 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
+from arm_companion.mission.hung_wrench import hung_wrench
+from arm_companion.mission.load import CARRYING, SHARING
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
-_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING})
+_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING}) | CARRYING
 _FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - {Phase.STARTUP, Phase.REACH}
 _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
@@ -175,7 +177,8 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     if holding:
         found = _weigh(found, s, solution)
     # how the bar pushes on an arm that touches but does not hold is not known
-    return _report(found, source, valid=source is not WrenchSource.CONTACT)
+    report = _report(found, source, valid=source is not WrenchSource.CONTACT)
+    return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
 
 
 def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:

@@ -68,7 +68,7 @@ def _draw(flight: RecordedFlight, plan: Callable[[Axes, RecordedFlight], None]) 
         figure = Figure(figsize=(6.4, 3.6), layout="constrained")
         axis = figure.subplots()
         for i, span in enumerate(flight.spans):
-            colour = _PERCHED if span.name == "PERCHED" else _SHADES[i % 2]
+            colour = _PERCHED if span.name in ("PERCHED", "HANGING") else _SHADES[i % 2]
             axis.axvspan(span.begin, span.end, color=colour, lw=0, zorder=0)
         axis.grid(axis="y", color="#e5e7eb", lw=0.6)
         axis.set_xlabel("time, s")

@@ -72,7 +72,7 @@ def _timeline(spans: Sequence[Span], seconds: float) -> str:
     total = max(seconds, 1e-9)
     parts = []
     for i, span in enumerate(spans):
-        colour = _PERCHED if span.name == "PERCHED" else _COLOURS[i % 2]
+        colour = _PERCHED if span.name in ("PERCHED", "HANGING") else _COLOURS[i % 2]
         x, width = 1000.0 * span.begin / total, 1000.0 * (span.end - span.begin) / total
         label = f"{span.name}, {span.begin:.1f} s to {span.end:.1f} s"
         parts.append(

@@ -12,7 +12,9 @@ from arm_companion.report.flight import RecordedFlight
 _HOT_DEGC: Final = 65.0
 _NEAR: Final = 0.9
 _AT_REST: Final = frozenset({"STARTUP", "STOWED", "READY"})
-_TOUCHING: Final = frozenset({"CONTACT", "WRAP", "VERIFY", "PERCHED", "UNLOAD", "RELEASE"})
+_TOUCHING: Final = frozenset(
+    {"CONTACT", "WRAP", "VERIFY", "PERCHED", "UNLOAD", "RELEASE", "LOAD_TRANSFER", "HANGING", "TAKE_BACK"}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +49,14 @@ def judge(flight: RecordedFlight) -> Verdict:
 
 
 def _headline(flight: RecordedFlight) -> str:
-    held = [span.end - span.begin for span in flight.spans if span.name == "PERCHED"]
-    if held:
-        after = [span.name for span in flight.spans[_last(flight, "PERCHED") + 1 :]]
+    for name, word in (("HANGING", "Hung"), ("PERCHED", "Perched")):
+        held = [span.end - span.begin for span in flight.spans if span.name == name]
+        if not held:
+            continue
+        after = [span.name for span in flight.spans[_last(flight, name) + 1 :]]
         let_go = "and let go" if "DEPART" in after else "and did not let go in this record"
         times = "once" if len(held) == 1 else f"{len(held)} times"
-        return f"Perched {times}, {sum(held):.0f} s in all, {let_go}."
+        return f"{word} {times}, {sum(held):.0f} s in all, {let_go}."
     tried = [span for span in flight.spans if span.name == "APPROACH"]
     if not tried:
         return "No perch was ordered."

@@ -27,6 +27,8 @@ _SLOW_BELOW_M = 1.0
 _TAKEN_OFF_WITHIN_M = 0.1
 _GROUND_CONTACT_S = 0.35
 _LANDED_S = 0.7
+_LOWER_LIMIT_LANDED_S = 1.0  # ArduPilot's LAND_DETECTOR_TRIGGER_SEC
+_LOWER_LIMIT_SHARE = 0.125  # of hover thrust, under which its motors count as at their lower limit
 _STOPPING_S = 0.7  # a held position lies ahead of a moving vehicle by its speed times this
 _STREAM_GAP_S = 0.5  # slower than 2 Hz is no stream
 _STREAM_STEADY_S = 1.0
@@ -106,7 +108,7 @@ class FlightModes:
         self._stream_lost = False
         self._anchor: tuple[Vec3, float] | None = None  # position and yaw that are held
         self._goal_z: float | None = None  # of a take-off in progress
-        self._armed_s = self._contact_s = self._landed_s = 0.0
+        self._armed_s = self._contact_s = self._landed_s = self._limit_s = 0.0
         self._release = 0.0
         self._was_airborne = False
 
@@ -261,7 +263,7 @@ class FlightModes:
         self._landed_s += dt
         if self._armed_s >= _SPOOL_UP_S and self._wants_up():
             self.landed, self._was_airborne = False, True
-            self._anchor, self._contact_s, self._release = None, 0.0, 0.0
+            self._anchor, self._contact_s, self._limit_s, self._release = None, 0.0, 0.0, 0.0
             self._say(mav.MAV_SEVERITY_INFO, "Takeoff detected")
             return
         if self._landed_s >= self._disarm_delay_s():
@@ -287,14 +289,26 @@ class FlightModes:
 
     def _feel_ground(self, estimate: Estimate, setpoint: MotionSetpoint, dt: float) -> None:
         """Asked to sink and not sinking means ground; rotors idle then, and soon it counts as landed."""
+        if not self._flavour.is_px4 and self._at_lower_limit(estimate, dt):
+            self._land()
+            return
         sink = setpoint.velocity_w[2]
         asked = sink is not None and sink >= 0.9 * _TOUCH_DOWN_M_PER_S and setpoint.position_w[2] is None
         north, east, down = estimate.velocity_w
         still = abs(down) < 0.4 * _TOUCH_DOWN_M_PER_S and math.hypot(north, east) < 0.5
         self._contact_s = self._contact_s + dt if asked and still else 0.0
         if self._contact_s >= _LANDED_S:
-            self.landed, self._landed_s, self._goal_z = True, 0.0, None
-            self._say(mav.MAV_SEVERITY_INFO, "Landing detected")
+            self._land()
+
+    def _land(self) -> None:
+        self.landed, self._landed_s, self._goal_z = True, 0.0, None
+        self._say(mav.MAV_SEVERITY_INFO, "Landing detected")
+
+    def _at_lower_limit(self, estimate: Estimate, dt: float) -> bool:
+        """ArduPilot believes in a landing in every mode: motors at their lower limit, and at rest, for a second."""
+        low = self._release == 1.0 and self.thrust_share < _LOWER_LIMIT_SHARE
+        self._limit_s = self._limit_s + dt if low and math.hypot(*estimate.velocity_w) < 0.5 else 0.0
+        return self._limit_s >= _LOWER_LIMIT_LANDED_S
 
     def _setpoint(self, estimate: Estimate) -> MotionSetpoint:
         if self._anchor is None:

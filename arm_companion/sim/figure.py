@@ -40,7 +40,9 @@ def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
 
 def _shade(axis: Axes, flight: Flight, start: float) -> None:
     for i, (name, a, b) in enumerate(flight.spans()):
-        axis.axvspan(a - start, b - start, color=_PERCHED if name == "PERCHED" else _SHADES[i % 2], lw=0, zorder=0)
+        axis.axvspan(
+            a - start, b - start, color=_PERCHED if name in ("PERCHED", "HANGING") else _SHADES[i % 2], lw=0, zorder=0
+        )
     axis.margins(x=0)
     axis.grid(axis="y", color="#e5e7eb", lw=0.6)
 

@@ -57,6 +57,7 @@ class Airframe:
         thrust_max: share of hover thrust at full throttle.
         thrust_min: share of hover thrust that flying rotors keep (MPC_THR_MIN 0.12 at MPC_THR_HOVER 0.5).
         torque_max: N m, about each body axis.
+        arm: m, from the centre to a rotor along a body axis: what thrust there is, it can turn the vehicle with.
         motor_lag: s, time constant of the rotors.
     """
 
@@ -66,6 +67,7 @@ class Airframe:
     thrust_max: float = 2.0
     thrust_min: float = 0.24
     torque_max: Vec3 = (1.8, 1.8, 0.35)
+    arm: float = 0.18
     motor_lag: float = 0.025
 
 
@@ -172,7 +174,7 @@ class FlightController:
         down, thrust, produced = self._attitude_and_thrust(acceleration, release)
         self._wind_up(acceleration, velocity_error, produced, thrust, dt)
         rate = self._attitude(estimate, down, setpoint)
-        torque = self._rates(estimate.rate_b, rate, dt)
+        torque = self._mix(thrust, self._rates(estimate.rate_b, rate, dt))
         self.thrust = thrust
         return self._spin(thrust * self.airframe.mass * GRAVITY, torque, dt)
 
@@ -297,6 +299,15 @@ class FlightController:
             bound = 0.5 * most / inertia
             integral[i] = clamp(integral[i] + gains.rate_integral[i] * error * dt, -bound, bound)
         return torque[0], torque[1], torque[2]
+
+    def _mix(self, thrust: float, torque: Vec3) -> Vec3:
+        """What of a torque the rotors can make at this thrust, since none of them pushes down.
+
+        Without airmode both flight stacks give up torque rather than thrust, roll and pitch alike.
+        """
+        most = thrust * self.airframe.mass * GRAVITY * self.airframe.arm
+        share = min(1.0, most / max(abs(torque[0]) + abs(torque[1]), 1e-9))
+        return share * torque[0], share * torque[1], torque[2]
 
     def _spin(self, thrust: float, torque: Vec3, dt: float) -> RotorCommand:
         """First-order lag of the rotors towards what is commanded."""

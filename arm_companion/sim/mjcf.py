@@ -159,6 +159,11 @@ def tendon(i: int) -> str:
     return f"tendon {i}"
 
 
+def rotor(i: int) -> str:
+    """Name of the disk that the propeller i, counted from 0, sweeps."""
+    return f"rotor {i}"
+
+
 def up(vector: Sequence[float]) -> tuple[float, float, float]:
     """World vector from NED to MuJoCo's z-up axes, or back."""
     return (vector[0] * NED_TO_UP[0], vector[1] * NED_TO_UP[1], vector[2] * NED_TO_UP[2])
@@ -175,8 +180,11 @@ def _airframe(config: Config, stand: float) -> str:
         f'<geom type="box" size="{_join(_BODY_HALF_SIZE)}" {solid}/>',
         f'<geom type="cylinder" size="{config.arm.pitch_radius_m}" fromto="{neck}" {solid}/>',
     ]
-    for sx, sy in ((1, 1), (1, -1), (-1, -1), (-1, 1)):
-        lines.append(f'<geom type="cylinder" size="{_ROTOR_RADIUS} 0.005" pos="{sx * x} {sy * y} {z}" {solid}/>')
+    for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
+        lines.append(
+            f'<geom name="{rotor(i)}" type="cylinder" size="{_ROTOR_RADIUS} 0.005" '
+            f'pos="{sx * x} {sy * y} {z}" {solid}/>'
+        )
         # The skids fold up in flight, as on camera drones: they meet the ground and nothing else.
         fx, fy = sx * _FOOT_OFFSET[0], sy * _FOOT_OFFSET[1]
         lines.append(

@@ -55,6 +55,7 @@ class Plant:
         self._bar = model.body(mjcf.BAR).id
         self._tip = model.site(mjcf.TIP).id
         self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
+        self._rotors = np.array([model.geom(mjcf.rotor(i)).id for i in range(4)])
         # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
         self._link_of_geom = np.full(model.ngeom, -1)
         for i in range(config.arm.disks + 1):
@@ -199,6 +200,7 @@ class Plant:
             tension=tension,
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
             body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
+            rotor_contact=bool(np.any(np.isin(data.contact.geom, self._rotors))),
         )
 
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:
@@ -218,7 +220,27 @@ class Plant:
         rotation = data.xmat[self._airframe].reshape(3, 3)
         force = -wrench[3:]
         torque = -wrench[:3] + np.cross(centre, force)
+        pushed, twisted = self._arm_against_airframe()
+        force, torque = force + pushed, torque + twisted
         return _vec3(rotation.T @ force), _vec3(rotation.T @ torque)
+
+    def _arm_against_airframe(self) -> tuple[Array, Array]:
+        """Force and torque, world axes up, about the airframe's centre of mass, of links that lie against it."""
+        model, data = self._model, self._data
+        force, torque, result = np.zeros(3), np.zeros(3), np.zeros(6)
+        for i in range(data.ncon):
+            contact = data.contact[i]
+            one, other = contact.geom
+            first = model.geom_bodyid[one] == self._airframe
+            link = self._link_of_geom[other if first else one]
+            if not (first or model.geom_bodyid[other] == self._airframe) or link < 0 or contact.efc_address < 0:
+                continue
+            mujoco.mj_contactForce(model, data, i, result)
+            # the contact's frame points from its first geom to its second, and the force acts on the second
+            push = (-1.0 if first else 1.0) * contact.frame.reshape(3, 3).T @ result[:3]
+            force += push
+            torque += np.cross(contact.pos - data.xpos[self._airframe], push)
+        return force, torque
 
     def _bar_contact(self) -> tuple[float, Vec3, float]:
         """Sum of normal forces, net force on the arm (NED) and wrap angle of the arm's contacts with the bar."""

@@ -40,3 +40,4 @@ class PlantTruth:
     tension: tuple[float, ...]  # N, true tendon tensions
     tip_position_w: Vec3  # m
     body_contact: bool  # the airframe itself touches bar or ground
+    rotor_contact: bool = False  # something, the arm too, reaches into a propeller's disk

@@ -29,9 +29,9 @@ class Progress:
         )
 
 
-def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
+def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Path]) -> None:
     """The table at the end, the verdict, and where to look further."""
-    table = Table(title="Anchor perch", title_justify="left", show_header=True, header_style="bold")
+    table = Table(title=title, title_justify="left", show_header=True, header_style="bold")
     table.add_column("what")
     table.add_column("value", justify="right")
     table.add_column("remark")
@@ -50,7 +50,8 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
             f"{wrench.predictions} predictions",
         )
     table.add_section()
-    table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
+    if not math.isnan(verdict.hover_error_m):
+        table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
     for move in verdict.moves:
         table.add_row(
             move.name,
@@ -69,23 +70,23 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
             console.print(f"  {path}", soft_wrap=True)
 
 
-def show_outcome(outcome: Outcome, stream: TextIO) -> None:
+def show_outcome(outcome: Outcome, done: str, stream: TextIO) -> None:
     """A line for one trial."""
-    what = "perched" if outcome.success else f"failed: {outcome.reason}"
+    what = done if outcome.success else f"failed: {outcome.reason}"
     print(f"seed {outcome.seed}: {what} ({outcome.words})", file=stream, flush=True)
 
 
-def show_summary(summary: Summary, stream: TextIO) -> None:
+def show_summary(title: str, done: str, summary: Summary, stream: TextIO) -> None:
     """How many of the trials succeeded, with the interval that the true share lies in, and why the others did not."""
     trials = len(summary.outcomes)
     low, high = summary.interval
-    table = Table(title=f"Anchor perch, {trials} trials", title_justify="left", show_header=True, header_style="bold")
+    table = Table(title=f"{title}, {trials} trials", title_justify="left", show_header=True, header_style="bold")
     table.add_column("what")
     table.add_column("trials", justify="right")
     table.add_column("share", justify="right")
     table.add_column("95 % interval (Wilson)", justify="right")
     share = f"{summary.success / trials:.0%}"
-    table.add_row("perched and let go", str(summary.success), share, f"{low:.0%} to {high:.0%}")
+    table.add_row(done, str(summary.success), share, f"{low:.0%} to {high:.0%}")
     table.add_row("harm: limit, airframe or fall", str(summary.harmed), f"{summary.harmed / trials:.0%}", "")
     table.add_section()
     for reason, count in summary.failures.items():

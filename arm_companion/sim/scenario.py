@@ -4,7 +4,7 @@ It sees what a ground station sees; the plant's truth is for the verdict alone.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from arm_companion.config.schema import Config
@@ -17,6 +17,10 @@ Say = Callable[[str], None]
 _PULL_M = 0.010
 _HOLD_S = 3.0
 _PULL_S = 4.0
+_HANG_S = 15.0
+_STANDS_S = 8.0
+_STREAM_S = 3.0  # a heartbeat tells of the arming within a second, and PX4 wants a second of stream
+_FORCE = 21196.0  # param2 of a disarming that asks for no landing
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -73,13 +77,23 @@ class Operator:
 
     async def fly_perch(self) -> str:
         """The whole flight. Returns why it failed, or an empty string."""
+        return await self._fly(self._perch, self._pull, self._release)
+
+    async def fly_hang(self) -> str:
+        """The same with a hang perch: the vehicle hangs for a while, takes its load back and leaves."""
+        return await self._fly(self._hang, self._release)
+
+    async def fly_hang_disarmed(self) -> str:
+        """A person disarms the hanging vehicle, arms it again, gives it back and has it leave."""
+        return await self._fly(self._hang, self._disarm_and_arm, self._release)
+
+    async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
         failure = ""
         try:
             await self._prepare()
             await self._take_off()
-            await self._perch()
-            await self._pull()
-            await self._release()
+            for act in acts:
+                await act()
         except (ScenarioFailed, TimeoutError) as error:
             failure = str(error) or "the operator waited too long"
             self._say(f"failed: {failure}")
@@ -104,8 +118,9 @@ class Operator:
         if self._ardupilot:
             # it takes off by command in GUIDED only, PX4 in any mode but OFFBOARD; and it tells only what is asked
             await self._take_external_control()
-            position = [float(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED), 100_000.0]
-            await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, position, "position messages")
+            for message in (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE):
+                asked = [float(message), 100_000.0]
+                await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, asked, "state messages")
         await self._vehicle(
             mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"
         )
@@ -122,6 +137,30 @@ class Operator:
     async def _perch(self) -> None:
         self._say("PERCH")
         await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
+
+    async def _hang(self) -> None:
+        self._say("PERCH, to hang")
+        await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 180.0, float(mav.ARM_PERCH_KIND_HANG))
+        start = asyncio.get_running_loop().time()
+        await asyncio.sleep(_HANG_S)
+        self._flight.marks.append(Mark("hang", start, asyncio.get_running_loop().time(), (0.0, 0.0, 0.0)))
+        if self._state() != "HANGING":
+            raise ScenarioFailed(f"the hanging ended by itself in {self._state()}")
+
+    async def _disarm_and_arm(self) -> None:
+        self._say("disarmed by force")
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [0.0, _FORCE], "disarming")
+        await self._wait(lambda: self._state() == "HANG_HOLD", 5.0, "the arm does not notice that the motors stand")
+        await asyncio.sleep(_STANDS_S)
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming")
+        await self._order(mav.MAV_CMD_ARM_READY, "READY", 5.0)
+        if self._ardupilot:  # it ignores set-points until it has been told to take off
+            await self._take_external_control()
+            await self._vehicle(mav.MAV_CMD_NAV_TAKEOFF, [0.0] * 6 + [self._height() + 0.3], "take-off")
+            await self._wait(lambda: not self._landed(), 5.0, "the autopilot does not take off")
+        else:
+            await asyncio.sleep(_STREAM_S)
+            await self._take_external_control()
 
     async def _pull(self) -> None:
         """Hold, then the paper's benchmark: 10 mm towards the bar in x, then in z, then x without compensation."""
@@ -147,16 +186,16 @@ class Operator:
 
     async def _release(self) -> None:
         self._say("RELEASE")
-        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 90.0)
+        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
 
     async def _come_home(self) -> None:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
-        quiet = ("STOWED", "READY", "HOLDING", "")
-        await self._wait(lambda: self._state() in quiet, 90.0, f"the arm stays in {self._state()}")
-        if self._state() == "HOLDING":
-            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 60.0)
+        quiet = ("STOWED", "READY", "HOLDING", "HANGING", "HANG_HOLD", "")
+        await self._wait(lambda: self._state() in quiet, 150.0, f"the arm stays in {self._state()}")
+        if self._state() in ("HOLDING", "HANGING", "HANG_HOLD"):
+            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
         if self._state() == "READY":
             await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
         self._say("landing")
@@ -165,8 +204,8 @@ class Operator:
 
     # --- small things ---
 
-    async def _order(self, command: int, name: str, timeout_s: float) -> None:
-        result = await self._link.command(command, [0.0] * 7, target=self._arm, timeout=timeout_s)
+    async def _order(self, command: int, name: str, timeout_s: float, first: float = 0.0) -> None:
+        result = await self._link.command(command, [first, *[0.0] * 6], target=self._arm, timeout=timeout_s)
         if result != mav.MAV_RESULT_ACCEPTED:
             raise ScenarioFailed(f"{name}: {self._why(result)}")
 
@@ -220,6 +259,10 @@ class Operator:
     def _height(self) -> float:
         position = self._link.latest("LOCAL_POSITION_NED", self._autopilot)
         return -position.z if position is not None else 0.0
+
+    def _landed(self) -> bool:
+        state = self._link.latest("EXTENDED_SYS_STATE", self._autopilot)
+        return state is not None and state.landed_state == mav.MAV_LANDED_STATE_ON_GROUND
 
     def _heartbeat(self) -> Any:
         return self._link.latest("HEARTBEAT", self._autopilot)

@@ -17,8 +17,8 @@ from statistics import NormalDist
 
 from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
+from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
-from arm_companion.sim.verdict import judge
 
 MODEL_ERROR = 0.1
 """Greatest relative difference between the plant and the controller's parameters."""
@@ -29,6 +29,7 @@ _BAR_ERROR_M = 0.01  # by how much what it is told is wrong, each axis
 _BAR_ERROR_DEG = 2.0
 _WIND_M_PER_S = 2.0
 _CONFIDENCE = 0.95
+_HARM = ("airframe", "propeller", "did not land", "the hanging vehicle")
 _OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
 
 
@@ -178,24 +179,26 @@ def draw(config: Config, seed: int) -> Draw:
     return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, bar told {error} mm off")
 
 
-def fly_one(file: str, settings: tuple[str, ...], seed: int) -> Outcome:
+def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "perch") -> Outcome:
     """One trial in simulated time, in this process.
 
     Args:
         file: configuration, read anew because a read one does not travel between processes.
         settings: options that override it.
         seed: of the trial.
+        scenario: which flight.
 
     Raises:
         ConfigError: the configuration cannot be used.
     """
     config = load(file, settings, os.environ)
     drawn = draw(config, seed)
-    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world))
-    verdict = judge(result.flight, result.failure)
+    script = SCENARIOS[scenario]
+    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=script.fly))
+    verdict = script.judge(result.flight, result.failure, drawn.world)
     samples = result.flight.samples
     most = max((max(sample.truth.tension) for sample in samples), default=0.0)
-    harm = [reason for reason in verdict.reason.split("; ") if "airframe touched" in reason or "did not land" in reason]
+    harm = [reason for reason in verdict.reason.split("; ") if any(word in reason for word in _HARM)]
     if most > _OVER * config.limits.tension_max_n:
         harm.append(f"a tendon carried {most:.1f} N")
     return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words)
@@ -207,6 +210,7 @@ def fly(
     seeds: Sequence[int],
     jobs: int,
     told: Callable[[Outcome], None] = lambda _: None,
+    scenario: str = "perch",
 ) -> Summary:
     """All trials, each in a process of `jobs`.
 
@@ -216,6 +220,7 @@ def fly(
         seeds: one for each trial.
         jobs: processes that fly at the same time.
         told: called with each outcome as it comes, in any order.
+        scenario: which flight.
 
     Raises:
         BrokenProcessPool: a process died.
@@ -223,7 +228,7 @@ def fly(
     spawn = multiprocessing.get_context("spawn")
     outcomes: list[Outcome] = []
     with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
-        waiting = [pool.submit(fly_one, file, tuple(settings), seed) for seed in seeds]
+        waiting = [pool.submit(fly_one, file, tuple(settings), seed, scenario) for seed in seeds]
         try:
             for done in as_completed(waiting):
                 outcomes.append(done.result())

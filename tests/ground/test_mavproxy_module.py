@@ -99,6 +99,12 @@ def test_before_its_heartbeat_nothing_goes_to_the_arm(rig: Rig, capsys: pytest.C
     assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_PERCH, 0, *[0.0] * 7)]
 
 
+def test_hang_is_a_perch_of_that_kind(rig: Rig) -> None:
+    rig.beat()
+    rig.type("hang")
+    assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_PERCH, 0, 1.0, *[0.0] * 6)]
+
+
 def test_what_gets_no_answer_is_repeated_and_then_told(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.beat()
     rig.type("jog 90 45")

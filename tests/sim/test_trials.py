@@ -100,23 +100,24 @@ class Pool:
     def __exit__(self, *_: object) -> None:
         pass
 
-    def submit(self, _: Any, __: str, ___: tuple[str, ...], seed: int) -> "Future[Outcome]":
+    def submit(self, _: Any, __: str, ___: tuple[str, ...], seed: int, scenario: str) -> "Future[Outcome]":
         future: Future[Outcome] = Future()
         good = seed != 8
-        future.set_result(Outcome(seed, good, "" if good else "no contact 6 cm past it", "", "drawn"))
+        future.set_result(Outcome(seed, good, "" if good else "no contact 6 cm past it", "", f"drawn for {scenario}"))
         return future
 
 
-@pytest.mark.parametrize(("seed", "code"), [(1, 0), (7, 1)])
+@pytest.mark.parametrize(("scenario", "seed", "code"), [("perch", 1, 0), ("perch", 7, 1), ("hang", 7, 1)])
 def test_the_command_line_prints_the_contract_and_says_by_its_exit_code_whether_all_succeeded(
-    seed: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    scenario: str, seed: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(trials, "ProcessPoolExecutor", Pool)
-    words = ["sim", "perch", "--simulated", "--trials", "4", "--jobs", "2", "--seed", str(seed), "--json"]
+    words = ["sim", scenario, "--simulated", "--trials", "4", "--jobs", "2", "--seed", str(seed), "--json"]
     assert main(words) == code
     out, err = capsys.readouterr()
     last = json.loads(out.splitlines()[-1])
-    assert (last["success"], last["trials"]) == (4 - code, 4)
+    assert (last["scenario"], last["success"], last["trials"]) == (scenario, 4 - code, 4)
+    assert f"drawn for {scenario}" in err
     assert sum(last["failures"].values()) == code
     assert last["interval_95"][0] < last["success"] / 4 <= last["interval_95"][1]
     assert "Wilson" in err

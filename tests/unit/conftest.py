@@ -22,6 +22,8 @@ HOVER = VehicleState(
     heartbeat_age_s=0.3,
     position_age_s=0.01,
     attitude_age_s=0.01,
+    throttle=0.5,
+    throttle_age_s=0.05,
 )
 
 

@@ -5,18 +5,21 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request
+from arm_companion.mission.load import CARRYING
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Phase, State
+from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Load, Phase, State
 
 DT = 0.01
 T0 = 100.0
 PLACE = (2.0, 0.0, -2.2)
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
-HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING})
+HUNG = Load(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
+HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}) | CARRYING
 """Phases in which the arm is around the bar."""
 
 Change = Callable[[Facts], Facts]
@@ -36,6 +39,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "position": PLACE,
         "contact_w": PLACE,
         "anchor": ANCHOR if held else None,
+        "load": HUNG if phase in CARRYING else Load(),
         "tension": (8.0, 4.0, 1.0, 4.0),
         "bend": bend,
         "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
@@ -76,6 +80,7 @@ class Run:
         if self.state.phase is not self.phases[-1]:
             self.phases.append(self.state.phase)
         self._check(before, facts, commands)
+        check_load(before, self.state, facts, commands)
         return commands
 
     def cycles(self, facts: Facts, seconds: float) -> None:
@@ -103,7 +108,8 @@ class Run:
         if setpoint is not None:
             values = (*setpoint.position_w, *setpoint.velocity_w, *setpoint.acceleration_w, setpoint.yaw)
             assert all(map(math.isfinite, values))
-            assert norm(setpoint.acceleration_w) <= limits.feedforward_m_per_s2 + 1e-9
+            most = GRAVITY if state.phase in CARRYING else limits.feedforward_m_per_s2
+            assert norm(setpoint.acceleration_w) <= most + 1e-9
             fastest = max(perch.approach_speed_m_per_s, 3.0 * perch.reach_speed_m_per_s, limits.vehicle_speed_m_per_s)
             assert norm(setpoint.velocity_w) <= fastest + 1e-9
             if state.phase not in MOVES_VEHICLE and facts.vehicle.control is Control.EXTERNAL:
@@ -117,12 +123,21 @@ class Run:
             assert math.hypot(*state.bend) <= limits.bend_max_rad + 1e-9 or math.hypot(*before.bend) >= math.hypot(
                 *state.bend
             )
-        if state.phase is before.phase and state.pulls and before.pulls:
+        if state.since == before.since and state.pulls and before.pulls:
             turned = math.hypot(state.bend[0] - before.bend[0], state.bend[1] - before.bend[1])
             assert turned <= perch.bend_speed_rad_per_s * 0.1 + 1e-9
         assert not commands.recover or state.phase in {Phase.STARTUP, Phase.STOWED}
         answered = [answer.request for answer in commands.answers]
         assert {request.id for request in facts.requests} <= set(answered), "every order is answered in its cycle"
+
+
+def check_load(before: State, state: State, facts: Facts, commands: Commands) -> None:
+    """An arm that may carry the vehicle does not move, and never opens over stopped motors."""
+    if state.phase in CARRYING:
+        assert commands.arm is ArmAction.HOLD, "an arm that may carry the vehicle does not move"
+    if before.phase in CARRYING and state.phase not in CARRYING:
+        assert before.phase is Phase.TAKE_BACK
+        assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
 
 
 def ask(facts: Facts, order: Order, *values: float, request: int = 7) -> Facts:

@@ -21,7 +21,7 @@ PX4, ARDUPILOT = mav.MAV_AUTOPILOT_PX4, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
 OFFBOARD = 6 << 16
 GUIDED = 4
 SETPOINT = Setpoint((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.5, 0.6, 0.7), 1.5)
-STREAMS = {31: 100.0, 32: 100.0, 245: 5.0}
+STREAMS = {31: 100.0, 32: 100.0, 245: 5.0, 74: 10.0}
 Peer = Any
 
 
@@ -59,6 +59,8 @@ class Rig:
                 self.position(1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
             if i % 20 == 0:
                 self.peer.send(mav.MAVLink_extended_sys_state_message(0, mav.MAV_LANDED_STATE_IN_AIR))
+            if i % 10 == 0:
+                self.peer.send(mav.MAVLink_vfr_hud_message(0.0, 0.0, 0, 47, 0.0, 0.0))
             if heartbeat and i % 100 == 0:
                 self.peer.heartbeat(PX4, OFFBOARD)
             await asyncio.sleep(0.01)
@@ -111,6 +113,7 @@ def test_state_is_what_the_messages_say_and_ages_with_the_loop(fly: Callable[...
         rig.attitude(0.8, 0.0, 0.0, 0.6)
         rig.position(1.0, 2.0, -3.0, 0.1, 0.2, 0.3)
         rig.peer.send(mav.MAVLink_extended_sys_state_message(0, mav.MAV_LANDED_STATE_IN_AIR))
+        rig.peer.send(mav.MAVLink_vfr_hud_message(0.0, 0.0, 0, 47, 0.0, 0.0))
         await asyncio.sleep(0.1002)
         state = rig.state
         assert state.attitude_wb == pytest.approx((0.8, 0.0, 0.0, 0.6))
@@ -118,6 +121,7 @@ def test_state_is_what_the_messages_say_and_ages_with_the_loop(fly: Callable[...
         assert state.position_w == pytest.approx((1.0, 2.0, -3.0))
         assert state.velocity_w == pytest.approx((0.1, 0.2, 0.3))
         assert (state.armed, state.landed, state.control, state.mode) == (True, False, Control.EXTERNAL, "OFFBOARD")
+        assert (state.throttle, state.throttle_age_s < 0.11) == (0.47, True)
         ages = (state.heartbeat_age_s, state.position_age_s, state.attitude_age_s)
         assert ages == pytest.approx((0.1, 0.1, 0.1), abs=1e-6)
 

@@ -249,7 +249,7 @@ def test_a_final_answer_that_got_lost_is_repeated_but_a_new_command_is_new(fly: 
         ("PERCH", (math.inf,), "param1 (kind) is not a number"),
         ("PERCH", (0.5,), "not a whole number"),
         ("PERCH", (7.0,), "outside 0 to 1"),
-        ("PERCH", (1.0,), "only the anchor perch"),
+        ("PERCH", (2.0,), "outside 0 to 1"),
         ("JOG", (0.0,), "outside 1 to 3"),
         ("JOG", (1.0, NAN, 0.0), "param2 (theta) is not a number"),
         ("JOG", (1.0, 13.0, 0.0), "param2 (theta) = 13"),

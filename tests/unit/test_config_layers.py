@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm_companion.__main__ import main
+from arm_companion.app import check_flyable, open_configured
+from arm_companion.arm.reaction import mount
 from arm_companion.config import document, load
 from arm_companion.config.describe import every, json_schema
 from arm_companion.config.layers import PREFIX, collect, files_of, shipped
@@ -148,10 +150,24 @@ def test_the_schema_takes_what_the_reader_takes() -> None:
         elif isinstance(value, int | float) and not isinstance(value, bool):
             assert float(str(schema.get("minimum", "-inf"))) <= value <= float(str(schema.get("maximum", "inf"))), path
 
-    files = sorted(file for folder in shipped() for file in folder.glob("*.toml"))
+    files = sorted(file for folder in shipped() for file in folder.rglob("*.toml"))
     assert files
     for file in files:
         check(collect(file).table, json_schema(), file.name)
+
+
+@pytest.mark.parametrize("file", sorted((ROOT / "configs" / "examples").glob("*.toml")), ids=lambda file: file.stem)
+def test_the_examples_can_be_used_and_all_but_the_bench_can_fly(file: Path) -> None:
+    config = load(file)
+    open_configured(config)
+    if file.stem == "bench":
+        with pytest.raises(ConfigError, match="autopilot"):
+            check_flyable(config)
+    else:
+        check_flyable(config)
+        assert config.vehicle.autopilot in file.stem or file.stem == "above_mount"
+    up = mount(config.mount.position_m, config.mount.rpy_deg).rotation[2, 2] < 0
+    assert up == (file.stem == "above_mount")
 
 
 # --- the command ---

@@ -122,8 +122,8 @@ PROVOCATIONS: dict[str, Provocation] = {
         "tendon 1 jumped",
         recall=_remember(watch=(TendonWatch(jumped="tendon 1 jumped"), _SUSPECT, _SUSPECT, _SUSPECT)),
     ),
-    "contact lost": Provocation("no grip|pull test failed|grip lost", moved((-0.2, 0.0, 0.0)), _lost_contact),
-    "slip": Provocation("grip lost", moved((-0.2, 0.0, 0.0))),
+    "contact lost": Provocation("no grip|pull test failed|grip lost|slip", moved((-0.2, 0.0, 0.2)), _lost_contact),
+    "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
     "stiffness test failed": Provocation("no grip|pull test failed", moved((-0.04, 0.0, 0.0)), _lost_contact),
     "wrench over its limit": Provocation(
@@ -131,6 +131,7 @@ PROVOCATIONS: dict[str, Provocation] = {
         recall=_remember(prediction=Prediction(T0, _WRENCH, (0, 0, 0.25), (0, 0), (0, 0, 0))),
     ),
     "model has no solution": Provocation("no solution", seconds=0.7, blind=True),
+    "throttle not told": Provocation("throttle is not known", vehicle(throttle_age_s=9.0)),
     "set-points not followed": Provocation("does not follow", moved((-2.0, 0.0, 0.0)), seconds=1.2),
     "estimator jumps": Provocation("position jumped", moved((0.0, 1.0, 0.0)), quiet_s=0.05),
     "cycle overrun": Provocation("cycle is late", stall_s=0.4),

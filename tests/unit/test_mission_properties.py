@@ -47,6 +47,8 @@ VEHICLES = st.builds(
     heartbeat_age_s=AGES,
     position_age_s=AGES,
     attitude_age_s=AGES,
+    throttle=st.floats(0.0, 1.0),
+    throttle_age_s=AGES,
 )
 TENDON = st.fixed_dictionaries(
     {
@@ -64,7 +66,7 @@ TENDON = st.fixed_dictionaries(
 PARAMETERS = {
     Order.JOG: st.tuples(st.sampled_from((1.0, 2.0, 3.0, 0.0, 9.0)), *[st.floats(-7.0, 7.0)] * 3),
     Order.FEEDFORWARD: st.sampled_from(((0.0,), (1.0,))),
-    Order.PERCH: st.just((0.0,)),
+    Order.PERCH: st.sampled_from(((0.0,), (1.0,))),
 }
 ORDERS = st.sampled_from(Order).flatmap(lambda order: st.tuples(st.just(order), PARAMETERS.get(order, st.just(()))))
 BARS = st.builds(

@@ -327,7 +327,7 @@ def test_a_command_becomes_a_request_and_its_fate_an_answer() -> None:
         (("FIRE", "n"), "no such command"),
         (("JOG", "n", 1.0, 99.0, 0.0), "outside"),
         (("JOG", "n", 1.5), "not a whole number"),
-        (("PERCH", "n", 1.0), "anchor perch"),
+        (("PERCH", "n", 2.0), "outside 0 to 1"),
     ],
 )
 def test_a_command_that_is_wrong_or_old_is_denied_with_the_reason(words: tuple[Any, ...], reason: str) -> None:

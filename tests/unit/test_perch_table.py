@@ -6,6 +6,7 @@ import pytest
 
 from arm_companion.mission.diagram import document
 from arm_companion.mission.facts import ArmFault, ArmFlag, Order
+from arm_companion.mission.load import CARRYING
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.mission import SAFE_ACTION
 from arm_companion.mission.perch import GRASPING, GRIPPED, TABLE
@@ -47,7 +48,7 @@ def test_an_abort_is_legal_in_every_phase(phase: Phase) -> None:
 def test_every_phase_that_flies_ends_by_itself_in_time(phase: Phase) -> None:
     limited = {source for row in TABLE.transitions if "time limit" in row.label for source in row.sources}
     limited |= {Phase.REACH}  # its time limit is the search for contact
-    if phase is not Phase.PERCHED:  # held until told
+    if phase not in (Phase.PERCHED, Phase.HANGING):  # held until told
         assert phase in limited
 
 
@@ -58,6 +59,15 @@ def test_a_gripping_arm_never_stows_or_departs_without_letting_go_first(phase: P
         Phase.STOWED,
         Phase.DEPART,
     }
+
+
+@pytest.mark.parametrize("phase", sorted(CARRYING, key=lambda p: p.value))
+def test_an_arm_that_may_carry_the_vehicle_leaves_through_the_motors_alone(phase: Phase) -> None:
+    after = {target for source, target in edges() if source is phase} - CARRYING
+    assert after == ({Phase.UNLOAD} if phase is Phase.TAKE_BACK else set())
+    assert not any(row.fails for row in TABLE.transitions if phase in row.sources and row.target not in CARRYING), (
+        "it is opened by what the motors do, never by a failure"
+    )
 
 
 def test_abort_rows_come_before_progress() -> None:

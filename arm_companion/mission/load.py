@@ -1,0 +1,173 @@
+"""How the vehicle's weight goes from its motors to an arm above, and back.
+
+The thrust is taken down by an acceleration in the set-point while the reference stays with the vehicle: both
+autopilots add it behind their position and velocity loops, which then have nothing to integrate. What the motors
+really do is read from their throttle, since an autopilot's idea of its hover thrust may drift while something else
+carries it. docs/adr/0018 says why neither a lowered position nor a disarm is used.
+"""
+
+import dataclasses
+
+from arm_companion.arm.reaction import GRAVITY
+from arm_companion.mission.facts import Vec3
+from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, norm, ramp, scale, sub
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import Load, Phase, State
+
+SHARING = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK})
+"""Phases in which we say how much of the weight the motors carry."""
+
+CARRYING = SHARING | {Phase.HANG_HOLD}
+"""Phases in which the arm may be all that keeps the vehicle from falling."""
+
+_HOVERING = frozenset({Phase.APPROACH, Phase.REACH})
+_HOVER_S = 2.0  # the hover's throttle is a mean over so long
+_PLACE_S = 3.0  # a slip is a move away from where the vehicle was on the mean of so long
+_CARRIED_S = 1.0
+_TRIM_PER_S = 0.3  # of the throttle's miss, slower than any autopilot's own loops
+_TRIM_MAX = 2.0  # m/s^2
+_URGENT = 4.0  # times faster when something is wrong
+_LIFT_M = 0.10  # over where it hung, beyond which the set-point does not rise
+_ROSE_M = 0.04  # a vehicle that rose by so much hangs no more, whatever its throttle
+_OFF_THE_GROUND_M = 0.3  # an autopilot that thinks it has landed takes off to a set-point so high
+_CLIMB_M_PER_S2 = 0.6
+
+
+# --- what is known of the load ---
+
+
+def throttle_known(s: Situation) -> bool:
+    """Whether the autopilot tells what its motors do."""
+    return s.facts.vehicle.throttle_age_s <= s.config.hang.throttle_timeout_s
+
+
+def motor_share(s: Situation) -> float | None:
+    """Thrust of the motors, share of the free hover's; None when nobody knows."""
+    hover = s.state.load.hover
+    return s.facts.vehicle.throttle / hover if hover > 0.0 and throttle_known(s) else None
+
+
+def sunk(s: Situation) -> float:
+    """How far the vehicle is below where it was when its load began to move, m."""
+    return s.state.position[2] - s.state.load.first
+
+
+def slid(s: Situation) -> float:
+    """The greater of the vehicle's moves down and along the bar within the last seconds, m: swinging is no slip."""
+    away = sub(s.state.position, s.state.load.place)
+    return max(away[2], abs(dot(away, s.bar.axis_w)))
+
+
+def keep_load(s: Situation) -> Load:
+    """What is known of the load after this cycle."""
+    load, vehicle, hang = s.state.load, s.facts.vehicle, s.config.hang
+    if s.state.phase in _HOVERING and throttle_known(s) and vehicle.armed and not vehicle.landed:
+        share = s.dt / (_HOVER_S + s.dt) if load.hover > 0.0 else 1.0
+        return dataclasses.replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
+    if s.state.phase not in SHARING:
+        return load
+    away = sub(s.state.position, load.place)
+    rests = load.share == load.step and norm(away) < hang.rest_m
+    return dataclasses.replace(
+        load,
+        place=add(load.place, scale(away, s.dt / (_PLACE_S + s.dt))),
+        rested_s=load.rested_s + s.dt if rests else 0.0,
+        carried_s=load.carried_s + s.dt if _motors_carry(s) else 0.0,
+    )
+
+
+def _motors_carry(s: Situation) -> bool:
+    """Whether the motors carry the vehicle: by their throttle, else because it has risen off the arm."""
+    if s.state.load.share < 1.0 or not s.facts.vehicle.armed or s.facts.vehicle.landed:
+        return False
+    share = motor_share(s)
+    return -sunk(s) >= _ROSE_M if share is None else share >= s.config.hang.carried_share
+
+
+def carried(s: Situation) -> bool:
+    """Whether the motors have carried the vehicle for long enough to let go."""
+    return s.state.load.carried_s >= _CARRIED_S
+
+
+# --- what is done about it ---
+
+
+def begin(s: Situation) -> State:
+    """Memory at the entry of the present phase, which is one of CARRYING."""
+    state, load, position = s.state, s.state.load, s.state.position
+    fresh = dataclasses.replace(load, rested_s=0.0, carried_s=0.0)
+    match state.phase:
+        case Phase.LOAD_TRANSFER:
+            load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0, place=position, first=position[2])
+            return dataclasses.replace(state, load=_next_step(s, load, -1.0), rest=s.probe)
+        case Phase.TAKE_BACK:
+            load = dataclasses.replace(fresh, place=position, first=position[2])
+            return dataclasses.replace(state, load=_next_step(s, load, 1.0))
+        case Phase.HANG_HOLD:
+            load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0)
+            return dataclasses.replace(state, load=load, bend=s.bend, bend_goal=s.bend, pulls=())
+    return dataclasses.replace(state, load=fresh)
+
+
+def share_on(s: Situation) -> Load:
+    """The shares after this cycle: towards the present step's, and on to the next one once the vehicle rests."""
+    load, hang = s.state.load, s.config.hang
+    if s.state.phase not in SHARING:
+        return load
+    urgent = s.state.phase is Phase.TAKE_BACK and bool(s.state.errors)
+    if urgent:
+        load = dataclasses.replace(load, step=1.0)
+    elif load.rested_s >= hang.rest_s and s.state.phase is not Phase.HANGING:
+        load = _next_step(s, load, -1.0 if s.state.phase is Phase.LOAD_TRANSFER else 1.0)
+    share = ramp(load.share, load.step, hang.share_per_s * (_URGENT if urgent else 1.0), s.dt)
+    trim = load.trim
+    if share == 1.0:
+        trim = 0.0
+    elif (measured := motor_share(s)) is not None:
+        trim += _TRIM_PER_S * (measured - share) * GRAVITY * s.dt
+    return dataclasses.replace(load, share=share, trim=min(max(trim, -_TRIM_MAX), _TRIM_MAX))
+
+
+def _next_step(s: Situation, load: Load, way: float) -> Load:
+    """The load with the next step's share, down (-1) or up (+1); a new step has not rested yet."""
+    hang = s.config.hang
+    stride = (1.0 - hang.idle_share) / hang.steps
+    step = load.step + way * stride
+    if step < hang.idle_share + 0.5 * stride:
+        step = hang.idle_share
+    elif step > 1.0 - 0.5 * stride:
+        step = 1.0
+    return load if step == load.step else dataclasses.replace(load, step=step, rested_s=0.0)
+
+
+def unloading(s: Situation) -> Vec3:
+    """Acceleration, m/s^2, world axes, that leaves the motors their share of the weight; never more than gravity."""
+    load = s.state.load
+    return (0.0, 0.0, min(max((1.0 - load.share) * GRAVITY + load.trim, 0.0), GRAVITY))
+
+
+def hung_reference(s: Situation, before: Reference) -> Reference:
+    """Where the vehicle is asked to be while the arm has a share of its weight.
+
+    With the vehicle itself, so that no loop winds up; once its motors are asked for all of the weight, slowly up,
+    until they have it.
+    """
+    state = s.state
+    if s.facts.vehicle.landed and state.phase is Phase.TAKE_BACK:
+        x, y, z = state.position
+        return Reference((x, y, z - _OFF_THE_GROUND_M), ZERO, before.yaw)
+    if state.phase is not Phase.TAKE_BACK or state.load.share < 1.0:
+        return Reference(state.position, ZERO, before.yaw)
+    x, y, _ = state.load.place if state.anchor is None else s.rest
+    top = state.load.first - _LIFT_M
+    if before.position[2] < top:  # it has just left what it thought was the ground
+        before = Reference(state.position, ZERO, before.yaw)
+    return follow(
+        before,
+        (x, y, top),
+        before.yaw,
+        speed=s.config.hang.lift_m_per_s,
+        acceleration=_CLIMB_M_PER_S2,
+        yaw_rate=0.0,
+        dt=s.dt,
+    )

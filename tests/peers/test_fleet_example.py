@@ -1,0 +1,113 @@
+"""The fleet example: what it shows of messages, that its vehicles do not meet, and its screen against mosquitto."""
+
+import asyncio
+import importlib.util
+import json
+import shutil
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import aiomqtt
+import pytest
+
+from arm_companion.clock import ticks
+from arm_companion.config import load
+
+SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "fleet" / "fleet.py"
+
+
+@pytest.fixture(scope="module")
+def fleet() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("fleet", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["fleet"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_a_vehicle_is_one_line_and_nonsense_changes_nothing(fleet: ModuleType) -> None:
+    vehicle = fleet.Vehicle("3")
+    assert "offline" in vehicle.line()
+    vehicle.hear("availability", b"online")
+    vehicle.hear("state", json.dumps({"state": "PERCHED"}).encode())
+    vehicle.hear("wrench", json.dumps({"force": [3.0, 0.0, 4.0], "valid": True}).encode())
+    vehicle.hear("tendons", json.dumps({"tension": [1.0, 27.5, None, 2.0]}).encode())
+    line = vehicle.line()
+    for words in ("online", "PERCHED", "5.00 N", "27.5 N"):
+        assert words in line
+    for nonsense in (b"", b"\xff", b"[]", b"{", b'"x"'):
+        vehicle.hear("state", nonsense)
+    assert vehicle.line() == line
+    vehicle.hear("wrench", json.dumps({"force": None, "valid": False}).encode())
+    assert "? N" in vehicle.line()
+
+
+def test_no_two_vehicles_share_a_port_or_a_bus(fleet: ModuleType, tmp_path: Path) -> None:
+    seen: set[str] = set()
+    for number in range(1, 5):
+        settings = list(fleet.settings(number, tmp_path, "127.0.0.1", 1883))
+        config = load("sim.toml", settings)
+        assert config.mqtt.vehicle == str(number)
+        own = {config.servos.port, config.links["autopilot"].url, config.links["ground"].url}
+        own |= {config.sim.operator_autopilot_url.rpartition(":")[2], config.mqtt.vehicle}
+        assert not own & seen
+        seen |= own
+
+
+@pytest.mark.realtime
+def test_the_screen_follows_a_broker(tmp_path: Path) -> None:
+    if shutil.which("mosquitto") is None:
+        pytest.skip("the example was not run against a broker: mosquitto is missing")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    (tmp_path / "mosquitto.conf").write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\n")
+    broker = subprocess.Popen(
+        ["mosquitto", "-c", str(tmp_path / "mosquitto.conf")], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+
+    async def main() -> str:
+        async with asyncio.timeout(30.0):
+            async for _ in ticks(0.1):
+                try:
+                    _, writer = await asyncio.open_connection("127.0.0.1", port)
+                except OSError:
+                    continue
+                writer.close()
+                break
+            words = [sys.executable, str(SCRIPT), "watch", "--port", str(port)]
+            screen = await asyncio.create_subprocess_exec(*words, stdout=asyncio.subprocess.PIPE)
+            assert screen.stdout is not None
+            async with aiomqtt.Client("127.0.0.1", port) as client:
+                for number in ("1", "2"):
+                    await client.publish(f"arm/{number}/availability", b"online", retain=True)
+                    await client.publish(f"arm/{number}/state", b'{"state": "PERCHED"}', retain=True)
+                told = b""
+                while told.count(b"PERCHED") < 2:
+                    told += await screen.stdout.readline()
+            screen.terminate()
+            await screen.communicate()
+            return told.decode()
+
+    try:
+        told = asyncio.run(main())
+    finally:
+        broker.terminate()
+        broker.wait()
+    assert {line.split()[0] for line in told.splitlines()} == {"1", "2"}
+
+
+def test_without_a_broker_it_says_so() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+        words = [sys.executable, str(SCRIPT), "watch", "--port", str(port)]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=30.0, check=False)
+    assert done.returncode == 1
+    assert str(port) in done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,298 @@
+"""The hang perch in steps: weight to the arm and back, and an arm that opens for nobody while it carries."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.reaction import GRAVITY
+from arm_companion.arm.rod_model import RodModel
+from arm_companion.config import load
+from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
+from arm_companion.mission.load import CARRYING
+from arm_companion.mission.situation import Parameters
+from arm_companion.mission.state import Load, PerchKind, Phase, State
+from tests.unit.conftest import HOVER, tendons
+from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Run, ask, memory, tendon, vehicle
+
+HOVER_THROTTLE = 0.5
+SPRING_M = 0.03  # by which the arm gives under the whole weight
+BENT = (5.5, 0.0)
+
+
+@pytest.fixture(scope="module")
+def above() -> Parameters:
+    config = load("sim_hang.toml")
+    slow = dataclasses.replace(config.rates, wrench_hz=5.0)
+    return Parameters(dataclasses.replace(config, rates=slow), RodModel(ArmParameters.of(config.arm)))
+
+
+@pytest.fixture(scope="module")
+def wrapped(above: Parameters) -> Facts:
+    """An arm at its wrap, and a vehicle that hovers under the bar."""
+    pulls = above.model.pull_for_bend(np.asarray(BENT))
+    hovering = dataclasses.replace(HOVER, position_w=PLACE)
+    return Facts(hovering, tendons(tuple(map(float, pulls)), (30.0, 11.0, 1.0, 11.0)))
+
+
+class Bar:
+    """A vehicle on a bar by a spring: motors that do what the set-point's acceleration says, as PX4's do."""
+
+    def __init__(self, run: Run, facts: Facts, holds: float = 1.0) -> None:
+        self.run, self.facts, self.holds = run, facts, holds
+        self.throttle = HOVER_THROTTLE
+
+    def cycle(self, facts: Facts | None = None, **fields: object) -> None:
+        setpoint = self.run.said[-1].setpoint if self.run.said else None
+        if setpoint is not None:
+            self.throttle = HOVER_THROTTLE * (1.0 - setpoint.acceleration_w[2] / GRAVITY)
+        x, y, z = PLACE
+        sunk = SPRING_M * (1.0 - self.throttle / HOVER_THROTTLE) * self.holds
+        known: dict[str, object] = {"position_w": (x, y, z + sunk), "throttle": self.throttle}
+        self.run.cycle(vehicle(**{**known, **fields})(facts or self.facts))
+
+    def until(self, phase: Phase, seconds: float, **fields: object) -> None:
+        for _ in range(round(seconds / DT)):
+            self.cycle(**fields)
+            if self.run.state.phase is phase:
+                return
+        raise AssertionError(f"{self.run.phases} without {phase.name} within {seconds} s: {self.run.texts}")
+
+    def order(self, order: Order, *values: float, **fields: object) -> tuple[Result, str]:
+        self.cycle(ask(self.facts, order, *values), **fields)
+        answer = self.run.said[-1].answers[-1]
+        return answer.result, answer.reason
+
+
+def verified(**fields: object) -> State:
+    """Memory at the end of a good pull test of a hang perch."""
+    known: dict[str, object] = {
+        "since": T0 - 3.5,
+        "kind": PerchKind.HANG,
+        "load": Load(hover=HOVER_THROTTLE),
+        "bend": BENT,
+        "bend_goal": BENT,
+        "anchor": dataclasses.replace(ANCHOR, position_w=PLACE),
+        "contact_w": (1.9, 0.0, -2.26),
+    }
+    return memory(Phase.VERIFY, **{**known, **fields})
+
+
+@pytest.fixture(scope="module")
+def transferred(above: Parameters, wrapped: Facts) -> Bar:
+    """A transfer of the load from its begin to its end, made once."""
+    bar = Bar(Run(verified(), above), wrapped)
+    bar.until(Phase.HANGING, 30.0)
+    return bar
+
+
+@pytest.fixture
+def hanging(transferred: Bar) -> Bar:
+    """A vehicle that has just come to hang."""
+    run = Run(transferred.run.state, transferred.run.parameters, said=[transferred.run.said[-1]])
+    bar = Bar(run, transferred.facts)
+    bar.throttle = transferred.throttle
+    return bar
+
+
+def test_the_thrust_goes_down_in_steps_that_each_wait_for_rest_until_the_vehicle_hangs(
+    above: Parameters, transferred: Bar
+) -> None:
+    bar, run = transferred, transferred.run
+    assert run.phases == [Phase.VERIFY, Phase.LOAD_TRANSFER, Phase.HANGING]
+    asked = [said.setpoint.acceleration_w[2] for said in run.said if said.setpoint is not None]
+    stood = [round(a / GRAVITY, 2) for a, b in zip(asked, asked[80:], strict=False) if abs(a - b) < 0.02]
+    stride = (1.0 - above.config.hang.idle_share) / above.config.hang.steps
+    for step in range(1, above.config.hang.steps):
+        assert any(abs(level - step * stride) < 0.03 for level in stood), f"no rest at step {step}"
+    assert bar.throttle == pytest.approx(above.config.hang.idle_share * HOVER_THROTTLE, abs=0.01)
+    for said in run.said[1:]:
+        assert said.setpoint is not None
+        assert math.dist(said.setpoint.position_w, PLACE) < 2.0 * SPRING_M, "the reference stays with the vehicle"
+
+
+def test_a_vehicle_that_does_not_come_to_rest_is_not_unloaded_further(above: Parameters, wrapped: Facts) -> None:
+    bar = Bar(Run(verified(), above), wrapped)
+    x, y, z = PLACE
+    for i in range(2000):
+        bar.cycle(position_w=(x + 0.05 * math.sin(0.016 * i), y, z))
+    first = 1.0 - (1.0 - above.config.hang.idle_share) / above.config.hang.steps
+    assert bar.run.state.load.share >= first - 1e-9
+    assert bar.run.state.phase is Phase.LOAD_TRANSFER
+
+
+@pytest.mark.parametrize("phase", [Phase.LOAD_TRANSFER, Phase.HANGING])
+def test_a_slip_brings_the_motors_up_at_once_and_then_the_arm_lets_go(
+    phase: Phase, above: Parameters, wrapped: Facts
+) -> None:
+    bar = Bar(Run(verified(), above), wrapped)
+    bar.until(phase, 30.0)
+    x, y, z = PLACE
+    for _ in range(3):
+        bar.cycle(velocity_w=(0.0, 0.0, 0.4), position_w=(x, y, z + 0.05))
+    assert bar.run.state.phase is Phase.TAKE_BACK
+    assert bar.run.state.errors & ArmFault.SLIP
+    bar.until(Phase.UNLOAD, 3.0)
+    assert bar.throttle == pytest.approx(HOVER_THROTTLE)
+
+
+def test_released_from_hanging_the_motors_take_the_load_in_steps_before_the_arm_moves(hanging: Bar) -> None:
+    bar = hanging
+    assert bar.order(Order.RELEASE)[0] is Result.IN_PROGRESS
+    began = len(bar.run.said)
+    bar.until(Phase.UNLOAD, 30.0)
+    assert all(said.pulls is None for said in bar.run.said[began:-1])
+    assert bar.throttle == pytest.approx(HOVER_THROTTLE)
+    assert bar.run.said[-1].setpoint is not None
+    assert bar.run.said[-1].setpoint.acceleration_w == (0.0, 0.0, 0.0)
+    bar.until(Phase.RELEASE, 10.0)
+
+
+@pytest.mark.parametrize("share", [0.3, 0.8])
+def test_motors_that_do_not_come_up_do_not_open_the_arm(share: float, hanging: Bar, wrapped: Facts) -> None:
+    bar = hanging
+    bar.order(Order.RELEASE)
+    for _ in range(700):
+        x, y, z = PLACE
+        sunk = vehicle(throttle=share * HOVER_THROTTLE, position_w=(x, y, z + SPRING_M))(wrapped)
+        bar.run.cycle(sunk, 0.1)
+    assert bar.run.state.phase is Phase.HANG_HOLD
+    assert bar.run.state.errors & ArmFault.TIMEOUT
+    assert set(bar.run.phases) <= CARRYING
+
+
+def test_the_pilot_takes_it_while_it_hangs_and_lifts_it_off_himself(hanging: Bar) -> None:
+    bar = hanging
+    pilot: dict[str, object] = {"control": Control.PILOT, "mode": "POSCTL"}
+    bar.cycle(None, **pilot)
+    assert bar.run.said[-1].setpoint is None
+    assert bar.run.state.phase is Phase.HANG_HOLD
+    bar.throttle = 0.3 * HOVER_THROTTLE
+    assert bar.order(Order.RELEASE, **pilot)[0] is Result.IN_PROGRESS
+    for _ in range(500):
+        bar.cycle(None, **pilot)
+    assert bar.run.state.phase is Phase.TAKE_BACK, "his motors do not carry it yet"
+    bar.throttle = HOVER_THROTTLE
+    bar.until(Phase.RELEASE, 5.0, **pilot)
+    assert all(said.setpoint is None for said in bar.run.said[-500:])
+
+
+@pytest.mark.parametrize(
+    "order", [Order.RELEASE, Order.STOW, Order.ABORT, Order.READY, Order.PERCH, Order.CLEAR_ERRORS]
+)
+def test_no_order_opens_an_arm_over_motors_that_stand(order: Order, hanging: Bar) -> None:
+    bar = hanging
+    bar.cycle(armed=False, landed=True)
+    assert bar.run.state.phase is Phase.HANG_HOLD
+    result, reason = bar.order(order, armed=False, landed=True)
+    for _ in range(300):
+        bar.cycle(armed=False, landed=True)
+    assert bar.run.state.phase is Phase.HANG_HOLD
+    assert all(said.pulls is None for said in bar.run.said[-300:])
+    if order is Order.RELEASE:
+        assert result is Result.TEMPORARILY_REJECTED
+        assert "arm it first" in reason
+
+
+def test_disarmed_while_it_hangs_it_is_armed_again_by_a_person_and_leaves(hanging: Bar) -> None:
+    bar = hanging
+    for _ in range(100):
+        bar.cycle(armed=False, landed=True, control=Control.PILOT)
+    assert any("hang by the arm" in text for text in bar.run.texts)
+    armed: dict[str, object] = {"landed": True, "control": Control.PILOT, "throttle": 0.0}
+    bar.cycle(None, **armed)
+    assert bar.run.said[-1].setpoint is None, "nobody has given the vehicle back"
+    assert bar.order(Order.READY, **armed)[0] is Result.ACCEPTED
+    bar.cycle(None, **armed)
+    assert bar.run.said[-1].setpoint is not None, "PX4 takes the switch only with a stream"
+    armed["control"] = Control.EXTERNAL
+    assert bar.order(Order.RELEASE, **armed)[0] is Result.IN_PROGRESS
+    bar.cycle(None, **armed)
+    up = bar.run.said[-1].setpoint
+    assert up is not None
+    assert up.position_w[2] < PLACE[2] - 0.2, "an autopilot that thinks it stands takes off to a set-point above"
+    bar.throttle = HOVER_THROTTLE
+    bar.until(Phase.RELEASE, 10.0)
+
+
+def test_an_arm_above_that_is_found_bent_may_carry_the_vehicle(above: Parameters, wrapped: Facts) -> None:
+    run = Run(State(t=T0), above)
+    grounded = vehicle(armed=False, landed=True)(wrapped)
+    run.cycles(grounded, 0.03)
+    assert run.phases == [Phase.STARTUP, Phase.HOLDING, Phase.HANG_HOLD]
+    commands = run.cycle(ask(grounded, Order.RELEASE))
+    assert commands.answers[0].result is Result.TEMPORARILY_REJECTED
+    # nobody knows its hover's throttle, so it has to rise
+    run.cycles(ask(wrapped, Order.READY), 0.05)
+    run.cycles(ask(wrapped, Order.RELEASE), 6.0)
+    assert run.state.phase is Phase.TAKE_BACK
+    x, y, z = PLACE
+    for i in range(300):
+        run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(wrapped))
+    assert run.state.phase in (Phase.UNLOAD, Phase.RELEASE)
+    run.cycles(vehicle(position_w=(x, y, z - 0.06))(wrapped), 1.5)
+    last = run.said[-1].setpoint
+    assert last is not None
+    assert math.dist(last.position_w, PLACE) < 0.2, "where the bar was met it does not know, so it stays"
+
+
+def test_no_cycle_lies_between_holding_and_hang_hold_in_which_the_arm_could_be_opened(
+    above: Parameters, wrapped: Facts
+) -> None:
+    run = Run(memory(Phase.HOLDING, bend=BENT), above)
+    commands = run.cycle(ask(vehicle(armed=False)(wrapped), Order.RELEASE))
+    assert commands.answers[0].result is Result.TEMPORARILY_REJECTED
+    assert run.state.phase is Phase.HANG_HOLD
+
+
+@pytest.mark.parametrize(
+    ("change", "settings", "words"),
+    [
+        (vehicle(throttle_age_s=9.0), (), "throttle"),
+        (vehicle(), ("limits.wrench_force_n=10.0",), "weight"),
+        (vehicle(), ("mount.rpy_deg=[0.0, 0.0, 0.0]",), "not above"),
+    ],
+)
+def test_a_hang_perch_is_refused_where_it_cannot_hang_and_an_anchor_perch_is_not(
+    change: Callable[[Facts], Facts], settings: tuple[str, ...], words: str, wrapped: Facts
+) -> None:
+    config = load("sim_hang.toml", settings)
+    parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
+    straight = tendons((0.0, 0.0, 0.0, 0.0), (4.0, 4.0, 4.0, 4.0))
+    facts = change(dataclasses.replace(wrapped, tendons=straight))
+    run = Run(memory(Phase.READY), parameters)
+    answer = run.cycle(ask(facts, Order.PERCH, 1.0)).answers[0]
+    assert (answer.result, words in answer.reason) == (Result.TEMPORARILY_REJECTED, True)
+    assert run.state.kind is PerchKind.ANCHOR
+    assert run.cycle(ask(facts, Order.PERCH, 0.0)).answers[0].result is Result.IN_PROGRESS
+
+
+@pytest.mark.parametrize("change", [tendon(0, temperature=70.0), tendon(3, voltage=9.7), tendon(1, silent=True)])
+def test_while_the_vehicle_is_ours_a_failing_part_brings_the_motors_up_and_else_a_person_is_asked(
+    change: Callable[[Facts], Facts], hanging: Bar, wrapped: Facts
+) -> None:
+    theirs = Bar(Run(hanging.run.state, hanging.run.parameters), wrapped)
+    pilot: dict[str, object] = {"control": Control.PILOT, "mode": "POSCTL"}
+    theirs.cycle(None, **pilot)
+    for _ in range(150):
+        hanging.cycle(change(wrapped))
+        theirs.cycle(change(wrapped), **pilot)
+    assert Phase.TAKE_BACK in hanging.run.phases
+    assert theirs.run.state.phase is Phase.HANG_HOLD
+    assert any("cannot let go" in text for text in theirs.run.texts)
+
+
+def test_the_wrench_of_a_hanging_vehicle_is_its_weight_less_what_the_motors_carry(
+    above: Parameters, hanging: Bar
+) -> None:
+    bar = hanging
+    for _ in range(50):
+        bar.cycle()
+    wrench = bar.run.said[-1].wrench
+    weight = above.config.vehicle.mass_kg * GRAVITY
+    assert wrench.valid
+    assert wrench.force_b[2] == pytest.approx(-0.75 * weight, rel=0.06)
+    assert wrench.force_sigma[2] < 0.1 * weight
