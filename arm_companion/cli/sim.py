@@ -161,20 +161,27 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
     _write_truth(arguments, result.flight)
     files = [figure, log, _record_path(arguments)]
-    filmed = True
-    if studio is not None:
-        progress.say(f"drawing {len(result.poses)} pictures")
-        try:
-            film.make(arguments.video, config, result.poses, studio)
-            files.append(arguments.video)
-        except (film.NoFilm, OSError) as error:
-            filmed = False
-            print(f"arm-companion sim: {error}", file=sys.stderr)
+    filmed = studio is None or _film(arguments.video, config, result.poses, studio, progress.console)
+    if studio is not None and filmed:
+        files.append(arguments.video)
     show_verdict(scenario.title, verdict, progress.console, files)
     if arguments.json:
         wall = time.perf_counter() - started
         print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
     return 0 if verdict.success and filmed else 1
+
+
+def _film(path: Path, config: Config, poses: Any, studio: Any, console: Any) -> bool:
+    """Draw it; whether that went well, which is said when not."""
+    from arm_companion.sim import film  # noqa: PLC0415 - after the check for the extra
+
+    console.print(f"drawing {len(poses)} pictures")
+    try:
+        film.make(path, config, poses, studio)
+    except (film.NoFilm, OSError) as error:
+        print(f"arm-companion sim: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _trials(arguments: argparse.Namespace, config: Config) -> int:

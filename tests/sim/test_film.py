@@ -1,15 +1,18 @@
 """The film of a simulated flight: drawn where there is OpenGL, and said plainly where something is missing."""
 
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from arm_companion.__main__ import main as command_line
+from arm_companion.cli.sim import _film
 from arm_companion.config import load
 from arm_companion.sim import film
 from arm_companion.sim.plant import Plant, Pose
+from arm_companion.sim.progress import Progress
 from arm_companion.sim.world import World
 
 CONFIG = load("sim.toml")
@@ -50,6 +53,17 @@ def test_a_film_has_all_pictures_and_shows_what_moves(tmp_path: Path, studio: fi
     brown = (seen[..., 0] > seen[..., 2] + 30) & (seen[..., 0] < 180)
     assert brown[0].sum() > 200, "the bar is in it"
     assert np.abs(seen[11] - seen[0]).max() > 60, "and something moves"
+
+
+def test_the_command_draws_it_and_says_when_that_fails(
+    tmp_path: Path, studio: film.Studio, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "flight.gif"
+    assert _film(file, CONFIG, poses(3), studio, Progress(sys.stdout).console)
+    assert file.read_bytes().startswith(b"GIF8")
+    assert "3 pictures" in capsys.readouterr().out
+    assert not _film(tmp_path, CONFIG, poses(1), studio, Progress(sys.stdout).console)
+    assert "could not be made" in capsys.readouterr().err
 
 
 def test_what_ffmpeg_cannot_write_is_told(tmp_path: Path, studio: film.Studio) -> None:
