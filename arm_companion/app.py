@@ -21,7 +21,6 @@ from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.mqtt_payloads import Health
-from arm_companion.drivers.mqtt_publisher import MqttPublisher
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.settings import Settings, state_directory
@@ -31,10 +30,12 @@ from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError, DeviceFault, ModelError
+from arm_companion.live.feed import Address
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
+from arm_companion.onlookers import Onlookers
 from arm_companion.record import configured_recorder
 from arm_companion.record.raw import tapped
 from arm_companion.record.recorder import Record, Recorder
@@ -104,6 +105,7 @@ class Daemon:
         compiled_model: bool = False,
         model: ArmModel | None = None,
         computer: ComputerWatch | None = None,
+        live: Address | None = None,
     ) -> None:
         check_flyable(config)
         self._config = config
@@ -143,9 +145,8 @@ class Daemon:
         self._computer = computer
         self._telemetry = Telemetry(self._links, config.rates, clock, computer.message if computer else None)
         self._servo_telemetry = ServoTelemetry(self._links, config.rates, clock)
-        self._mqtt = MqttPublisher(config.mqtt, clock, self._component.commands) if config.mqtt.host else None
-        if self._mqtt is not None:
-            self._component.hearers.append(self._mqtt.event)
+        self._onlookers = Onlookers(config, clock, self._component.commands, live)
+        self._component.hearers.append(self._onlookers.notice)
         self._started = clock.now()
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
         self._bus = ServoBus(
@@ -185,7 +186,7 @@ class Daemon:
                 self._component.run,
                 self._keys.run,
                 self._bus.run,
-                *(() if self._mqtt is None else (self._mqtt.run,)),
+                *self._onlookers.runs,
                 *(() if self._computer is None else (self._computer.run,)),
                 self._cycles,
             )
@@ -264,7 +265,9 @@ class Daemon:
         before = self._state
         self._state, commands = step(before, facts, now, self._parameters)
         await self._act(commands, facts, now)
-        self._recorder.put(Record(now, facts, before, commands))
+        record = Record(now, facts, before, commands)
+        self._recorder.put(record)
+        self._onlookers.publish(record, Situation(self._state, facts, now, self._parameters), self._health)
         for text in self._recorder.troubles():
             log.warning("%s", text)
             self._component.notify(Notice(Severity.WARNING, text))
@@ -348,8 +351,6 @@ class Daemon:
             stiffness=commands.stiffness,
             payload=commands.payload,
         )
-        if self._mqtt is not None:
-            self._mqtt.publish(now, facts, commands, self._health)
 
     def _health(self) -> Health:
         links = {link.name: link.connected for link in self._links}
@@ -383,6 +384,7 @@ class Daemon:
             self._component.set_limits(config.limits)
         self._config = config
         self._recorder.configure(self._clock.now(), config)
+        self._onlookers.configure(config)
         self._parameters = Parameters(config, self._parameters.model)
         self._telemetry.set_rates(config.rates)
 

@@ -115,6 +115,7 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
     names = tuple(kinds)
     get = operator.attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
+    get_numbers = operator.attrgetter(*numbers) if len(numbers) > 1 else None
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _writer(hint)) != _same]
     last: tuple[Any, Any] = (None, None)
 
@@ -125,10 +126,14 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
             table = dict(zip(names, get(value), strict=True))
             for name, write_field in others:
                 table[name] = write_field(table[name])
-            for name in numbers:
-                number = table[name]
-                if number - number != 0.0:
-                    table[name] = repr(number)
+            if get_numbers is not None:
+                total = sum(get_numbers(value))
+                finite = total - total == 0.0  # of most records, and then none of its numbers is looked at
+            else:
+                finite = False
+            if not finite:
+                for name in numbers:
+                    table[name] = _number(table[name])
             last = (value, table)
         return table
 
@@ -166,9 +171,21 @@ def _tuple_builder(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
 
 
 def _record_builder(cls: Any) -> Callable[[Any], Any]:
-    builders = {name: _builder(hint) for name, hint in fields(cls).items()}
+    kinds = fields(cls)
+    names = kinds.keys()
+    numbers = tuple(name for name, hint in kinds.items() if hint is float)
+    others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _builder(hint)) != _same]
 
     def make(table: dict[str, Any]) -> Any:
-        return cls(**{name: builders[name](item) for name, item in table.items()})
+        if not table.keys() <= names:
+            raise KeyError(*(table.keys() - names))
+        table = dict(table)
+        for name in numbers:
+            if type(table.get(name, 0.0)) is not float:
+                table[name] = float(table[name])
+        for name, each in others:
+            if name in table:
+                table[name] = each(table[name])
+        return cls(**table)
 
     return make

@@ -164,6 +164,10 @@ class _Detail:
             np.array([arc.tip_position(x * self.u, x * self.P.L) for x in shares]),
         )
 
+    def line(self) -> Array:
+        """See `Detail.line`."""
+        return self.sections(np.linspace(0.0, self.P.L, 13))[1]
+
     def path_beyond(self, s: float) -> Array:
         """See `Detail.path_beyond`."""
         rest = 1 - s / self.P.L

@@ -169,6 +169,9 @@ class Detail(Protocol):
     def sections(self, at: Array) -> tuple[Array, Array]:
         """Rotations (k, 3, 3) and positions (k, 3) of the sections at arc lengths `at` (k,), m."""
 
+    def line(self) -> Array:
+        """Backbone (k, 3), m, from base to end at whatever points are known anyway: cheap enough for a cycle."""
+
     def path_beyond(self, s: float) -> Array:
         """How much the arm beyond arc length s shortens each tendon's path (n,), m."""
 

@@ -70,6 +70,11 @@ class RodDetail:
             start = start + 0.5 * mesh.lengths[k] * legendre.legval(1.0, integral)
         return R, p
 
+    def line(self) -> Array:
+        """See `Detail.line`: base, nodes and end."""
+        state = self.solved.state
+        return np.vstack((np.zeros(3), (state.t @ self.rod.mesh.inner).T, state.tip))
+
     def path_beyond(self, s: float) -> Array:
         """See `Detail.path_beyond`."""
         rod, mesh, cables = self.rod, self.rod.mesh, self.solved.state.cables

@@ -5,6 +5,7 @@ import os
 
 from arm_companion.config import Config, load
 from arm_companion.config.layers import SYSTEM_FILE
+from arm_companion.live.feed import Address
 
 
 def add_config_arguments(parser: argparse.ArgumentParser, default: str = str(SYSTEM_FILE)) -> None:
@@ -17,6 +18,18 @@ def add_config_arguments(parser: argparse.ArgumentParser, default: str = str(SYS
         default=[],
         dest="settings",
         help="override one option, such as perch.bar_radius_m=0.02; may be repeated",
+    )
+
+
+def add_live_argument(parser: argparse.ArgumentParser) -> None:
+    """`--live`."""
+    parser.add_argument(
+        "--live",
+        type=Address.read,
+        nargs="?",
+        const=Address(),
+        metavar="HOST:PORT",
+        help=f"serve a live view for Foxglove (default: {Address()}); whoever reaches it can look",
     )
 
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 from arm_companion.app import Daemon, open_configured
-from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
 from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.settings import state_directory, with_kept_changes
@@ -23,6 +23,7 @@ START_AGAIN = 75
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion run`."""
     add_config_arguments(parser)
+    add_live_argument(parser)
     parser.add_argument("--verbose", action="store_true", help="log every state of links and servos")
 
 
@@ -46,7 +47,9 @@ def run(arguments: argparse.Namespace) -> int:
             clock = Clock(asyncio.get_running_loop(), unix_now())
             computer = ComputerWatch(state_directory(config) or Path("/"))
             openers = open_configured(config)
-            daemon = Daemon(config, openers, clock, manager, compiled_model=True, computer=computer)
+            daemon = Daemon(
+                config, openers, clock, manager, compiled_model=True, computer=computer, live=arguments.live
+            )
             await daemon.run(stop)
             return START_AGAIN if daemon.power is Power.RESTART else 0
         finally:

@@ -11,11 +11,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from arm_companion.cli.common import add_config_arguments, load_from
+from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
 _CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "world": "sim.toml"}
+_FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_config_arguments(parser, default="sim.toml, for hang sim_hang.toml")
     parser.set_defaults(config=None)
+    add_live_argument(parser)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
     parser.add_argument(
@@ -43,6 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         default=os.cpu_count() or 1,
         help="processes that fly trials at the same time (default: one a processor)",
+    )
+    parser.add_argument(
+        "--video",
+        type=Path,
+        metavar="FILE",
+        help=f"draw the flight off-screen when it is over, as {', '.join(_FILMS)}; takes OpenGL and ffmpeg",
     )
     parser.add_argument("--json", action="store_true", help="print the verdict as one JSON object on the last line")
     parser.add_argument(
@@ -70,6 +78,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
         print("arm-companion sim: --trials flies in simulated time: sim perch|hang --simulated", file=sys.stderr)
         return 2
+    if arguments.live is not None and arguments.simulated:
+        print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
+        return 2
+    if arguments.video is not None and (why := _no_video(arguments)):
+        print(f"arm-companion sim: --video {why}", file=sys.stderr)
+        return 2
     arguments.config = arguments.config or _CONFIGS[arguments.scenario]
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
@@ -82,6 +96,15 @@ def run(arguments: argparse.Namespace) -> int:
         return _trials(arguments, config)
     arguments.output.mkdir(parents=True, exist_ok=True)
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
+
+
+def _no_video(arguments: argparse.Namespace) -> str:
+    """Why there can be no film whatever is installed; empty: there can."""
+    if arguments.scenario == "world" or arguments.trials is not None:
+        return "films one flight: sim perch or hang, without --trials"
+    if arguments.video.suffix not in _FILMS:
+        return f"{arguments.video}: a film's name ends with one of {', '.join(_FILMS)}"
+    return ""
 
 
 def _serve(arguments: argparse.Namespace, config: Config) -> int:
@@ -105,17 +128,27 @@ def _serve(arguments: argparse.Namespace, config: Config) -> int:
 
 
 def _fly(arguments: argparse.Namespace, config: Config) -> int:
-    from arm_companion.sim.figure import draw  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim import film  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.figure import draw  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.progress import Progress, show_verdict  # noqa: PLC0415
+    from arm_companion.sim.world import World  # noqa: PLC0415
 
     output: Path = arguments.output
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
     try:
-        result = (
-            _simulated(arguments, config, progress) if arguments.simulated else _real_time(arguments, config, progress)
-        )
+        studio = None if arguments.video is None else film.studio()
+    except film.NoFilm as error:
+        print(f"arm-companion sim: no video: {error}", file=sys.stderr)
+        return 2
+
+    def prepare(world: World) -> None:
+        world.pose_every_s = None if studio is None else 1.0 / film.PICTURES_PER_S
+
+    try:
+        fly = _simulated if arguments.simulated else _real_time
+        result = fly(arguments, config, progress, prepare)
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
@@ -127,11 +160,28 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     start = result.flight.samples[0].t if result.flight.samples else 0.0
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
     _write_truth(arguments, result.flight)
-    show_verdict(scenario.title, verdict, progress.console, [figure, log, _record_path(arguments)])
+    files = [figure, log, _record_path(arguments)]
+    filmed = studio is None or _film(arguments.video, config, result.poses, studio, progress.console)
+    if studio is not None and filmed:
+        files.append(arguments.video)
+    show_verdict(scenario.title, verdict, progress.console, files)
     if arguments.json:
         wall = time.perf_counter() - started
         print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
-    return 0 if verdict.success else 1
+    return 0 if verdict.success and filmed else 1
+
+
+def _film(path: Path, config: Config, poses: Any, studio: Any, console: Any) -> bool:
+    """Draw it; whether that went well, which is said when not."""
+    from arm_companion.sim import film  # noqa: PLC0415 - after the check for the extra
+
+    console.print(f"drawing {len(poses)} pictures")
+    try:
+        film.make(path, config, poses, studio)
+    except (film.NoFilm, OSError) as error:
+        print(f"arm-companion sim: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _trials(arguments: argparse.Namespace, config: Config) -> int:
@@ -183,23 +233,24 @@ def _record_path(arguments: argparse.Namespace) -> Path:
     return path
 
 
-def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
     fly = SCENARIOS[arguments.scenario].fly
-    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments), fly=fly))
+    return run_simulated(fly_simulated(config, progress.say, prepare, _record_path(arguments), fly=fly))
 
 
-def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say, fly=fly))
+        log = arguments.output / "daemon.log"
+        return runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:
@@ -207,6 +258,8 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
     words = ["run", "--config", arguments.config]
     for setting in (*arguments.settings, f'record.file="{_record_path(arguments).resolve()}"'):
         words += ["--set", setting]
+    if arguments.live is not None:
+        words += ["--live", str(arguments.live)]
     return words
 
 

@@ -27,6 +27,7 @@ from arm_companion.config.hang_options import HangConfig
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.config.mqtt_options import MqttConfig
 from arm_companion.config.options import section
+from arm_companion.config.page_options import PageConfig
 from arm_companion.config.servo_options import CalibrationConfig, ServosConfig
 from arm_companion.errors import ConfigError
 
@@ -44,6 +45,7 @@ __all__ = [
     "MavlinkConfig",
     "MountConfig",
     "MqttConfig",
+    "PageConfig",
     "PerchConfig",
     "RatesConfig",
     "RecordConfig",
@@ -72,6 +74,7 @@ class Config:
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)
+    page: PageConfig = section(PageConfig)
     sim: SimConfig = section(SimConfig)
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ from arm_companion.config.schema import Config
 from arm_companion.doctor.check import Check, Outcome, fail, ok, warn
 from arm_companion.doctor.machine_checks import no_config
 from arm_companion.doctor.subject import Subject
+from arm_companion.drivers.field_page import check_token
 from arm_companion.drivers.mqtt_publisher import check_files
 from arm_companion.drivers.signing_keys import read_key
 from arm_companion.errors import ConfigError
@@ -59,6 +60,7 @@ def _keys(config: Config) -> Iterator[Outcome]:
             yield fail(f"link {name}: {error}", "mend the file of the key")
     try:
         check_files(config.mqtt)
+        check_token(config.page.token_file)
     except ConfigError as error:
         yield fail(str(error), "mend the file that it names")
 

@@ -1,27 +1,22 @@
 """The connection to the broker, in a process of its own: `python -m arm_companion.drivers.mqtt_client`.
 
-Standard input brings one line of settings, then `[topic, payload]` in each line; standard output gives `["command",
-payload]` and `["log", text]`. The end of the input ends it.
+What it is fed goes to the broker; commands of the broker's go back as `["command", payload]`: see `side_process`.
 """
 
 import asyncio
 import contextlib
-import json
-import os
 import random
-import resource
-import signal
 import ssl
-import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import aiomqtt
 from aiomqtt import ProtocolVersion
 
 from arm_companion.config.mqtt_options import MqttConfig
+from arm_companion.drivers.side_child import Take, run, tell
 from arm_companion.protocol.mqtt import LONGEST_COMMAND, OFFLINE, ONLINE, Packet, topic
 
 _FIRST_DELAY_S: Final = 0.5
@@ -30,7 +25,6 @@ _FAREWELL_S: Final = 1.0
 _MOST_MEMORY: Final = 512 << 20
 _COMMANDS_PER_S: Final = 20
 _MOST_INCOMING: Final = 64
-_LINE_LIMIT: Final = 1 << 20
 
 _VERSIONS: Final = {
     "auto": (ProtocolVersion.V5, ProtocolVersion.V311),
@@ -219,52 +213,18 @@ def _tls(config: MqttConfig) -> ssl.SSLContext | None:
     return context
 
 
-async def _standard_input() -> asyncio.StreamReader:
-    reader = asyncio.StreamReader(limit=_LINE_LIMIT)
-    loop = asyncio.get_running_loop()
-    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
-    return reader
-
-
-def _write(kind: str, value: str) -> None:
-    """One line for the daemon; when that is gone, we soon are, too."""
-    with contextlib.suppress(BrokenPipeError):
-        sys.stdout.write(json.dumps([kind, value]) + "\n")
-        sys.stdout.flush()
-
-
-async def main() -> None:
-    """Publish what standard input brings, until it ends or SIGTERM comes."""
-    lines = await _standard_input()
-    settings = json.loads(await lines.readline() or "{}")
+def main(settings: dict[str, Any]) -> tuple[Take, Awaitable[None]]:
+    """Publish what standard input brings."""
     config = MqttConfig(**settings)
     backlog = Backlog(config.queue_length)
     connection = Connection(
         config,
         backlog,
-        lambda payload: _write("command", payload.decode(errors="replace")),
-        lambda text: _write("log", text),
+        lambda payload: tell("command", payload.decode(errors="replace")),
+        lambda text: tell("log", text),
     )
-    work = asyncio.create_task(connection.run())
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, work.cancel)
-
-    async def read() -> None:
-        while line := await lines.readline():
-            name, payload = json.loads(line)
-            backlog.put(Packet(name, payload.encode()))
-
-    reading = asyncio.create_task(read())
-    await asyncio.wait((work, reading), return_when=asyncio.FIRST_COMPLETED)
-    for task in (work, reading):
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+    return lambda name, payload: backlog.put(Packet(name, payload.encode())), connection.run()
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(OSError, ValueError):  # the unit's system calls may lack it
-        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_MEMORY, _MOST_MEMORY))
-    with contextlib.suppress(OSError):
-        os.nice(5)
-    asyncio.run(main())
+    run(main, _MOST_MEMORY)

@@ -39,6 +39,8 @@ _QUEUE: Final = 1000
 _SYNC_S: Final = 2.0
 _RETRY_S: Final = 10.0
 _RAW_S: Final = 1.0
+_JOIN_S: Final = 0.05
+"""Raw bytes of a pipe that are one message of the record."""
 _BREATH_S: Final = 0.001
 _GATHER_S: Final = 0.025
 _FEW: Final = 10
@@ -106,6 +108,7 @@ class FileRecorder(Recorder):
         self._file: McapFile | None = None
         self._parts = 0
         self._begun = ""
+        self._frames: list[Frame] = []
         self._config: Config | None = None
         self._synced = self._retry_at = float("-inf")
         self._failing = False
@@ -246,15 +249,21 @@ class FileRecorder(Recorder):
             if change is not None:
                 before, after, cause = change
                 file.json(TRANSITIONS, now, {"t": t, "before": before, "after": after, "cause": cause})
-        for (pipe, sent), frames in _joined(batch.frames).items():
-            way = "sent" if sent else "received"
-            file.raw(f"{RAW}{pipe}/{way}", self._ns(frames[0].t), b"".join([frame.data for frame in frames]))
+        self._frames += batch.frames
+        if self._frames and self._frames[-1].t - self._frames[0].t >= _JOIN_S:
+            self._write_frames(file)
         if (record := batch.record) is not None:
             now = self._ns(record.t)
             stamp = {"t": record.t}
             file.json(FACTS, now, stamp | plain(record.facts), batch.sequence)
             file.json(STATE, now, plain(record.state), batch.sequence)
             file.json(COMMANDS, now, stamp | plain(record.commands), batch.sequence)
+
+    def _write_frames(self, file: McapFile) -> None:
+        frames, self._frames = self._frames, []
+        for (pipe, sent), some in _joined(frames).items():
+            way = "sent" if sent else "received"
+            file.raw(f"{RAW}{pipe}/{way}", self._ns(some[0].t), b"".join([frame.data for frame in some]))
 
     def _write_config(self, file: McapFile, t: float, config: Config) -> None:
         file.json(CONFIGURATION, self._ns(t), {"t": t, "config": as_table(config)})
@@ -286,6 +295,7 @@ class FileRecorder(Recorder):
         if self._file is not None:
             self._file.abandon()
             self._file = None
+        self._frames.clear()
         self._retry_at = (batch.t or 0.0) + _RETRY_S
         if not self._failing:
             self._failing = True
@@ -296,6 +306,7 @@ class FileRecorder(Recorder):
         if file is None:
             return
         try:
+            self._write_frames(file)
             file.close()
         except OSError as error:
             file.abandon()
@@ -306,7 +317,7 @@ class FileRecorder(Recorder):
 
 
 def _joined(frames: list[Frame]) -> dict[tuple[str, bool], list[Frame]]:
-    """Frames by pipe and direction: one message a cycle for each, since a message costs more than its bytes."""
+    """Frames by pipe and direction: one message for each, since a message costs more than its bytes."""
     found: dict[tuple[str, bool], list[Frame]] = {}
     for frame in frames:
         found.setdefault((frame.pipe, frame.sent), []).append(frame)

@@ -1,17 +1,23 @@
 """Reads records: all parts in order, as far as the bytes go."""
 
+import struct
 from collections.abc import Collection, Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import IO, NamedTuple
 
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
-from mcap.records import Channel, Chunk, Message, Metadata
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Metadata
+from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
 from arm_companion.errors import RecordError
 from arm_companion.record import storage
 from arm_companion.record.topics import FORMAT, METADATA
 
+_RECORD = struct.Struct("<BQ")  # opcode, length
+_MESSAGE = struct.Struct("<HIQ8x")  # channel, sequence, log time; the time of publishing is the same
 _LARGEST = 64 * 1024 * 1024
 """No record of ours is longer; a damaged length must not ask for all the memory."""
 
@@ -69,7 +75,7 @@ class Reader:
             while True:
                 try:
                     record = next(records, None)
-                    inside = breakup_chunk(record, validate_crc=True) if isinstance(record, Chunk) else []
+                    inside = _content(record) if isinstance(record, Chunk) else b""
                 except Exception as error:  # noqa: BLE001 - damaged bytes show in any way, in zstd's as well
                     end = isinstance(error, EndOfFile) or _at_end(stream)
                     self.remarks.append(
@@ -80,18 +86,41 @@ class Reader:
                     return
                 if record is None:
                     return
-                for entry in inside:
-                    if isinstance(entry, Channel):
-                        names[entry.id] = entry.topic
-                    elif isinstance(entry, Message):
-                        topic = names.get(entry.channel_id, "")
-                        if topics is None or topic in topics:
-                            yield Item(topic, entry.sequence, entry.log_time, entry.data)
+                yield from _messages(inside, names, topics)
 
 
 def truth_beside(path: Path) -> Path:
     """Where the simulator puts the plant's truth that belongs to a record."""
     return path.with_name(f"{path.stem}.truth.mcap")
+
+
+def _content(chunk: Chunk) -> bytes:
+    """The records inside a chunk, still as bytes; raises whatever damaged ones lead to."""
+    stream, length = get_chunk_data_stream(chunk, validate_crc=True)
+    return stream.read(length)
+
+
+def _messages(inside: bytes, names: dict[int, str], topics: Collection[str] | None) -> Iterator[Item]:
+    """The wanted messages of a chunk; the library's own way makes an object of every record, wanted or not.
+
+    Args:
+        inside: the records.
+        names: topic of each channel so far; those of the chunk are added.
+        topics: that are wanted; None: all.
+    """
+    at = 0
+    while at < len(inside):
+        opcode, length = _RECORD.unpack_from(inside, at)
+        at += _RECORD.size
+        if opcode == Opcode.MESSAGE:
+            channel, sequence, log_time = _MESSAGE.unpack_from(inside, at)
+            topic = names.get(channel, "")
+            if topics is None or topic in topics:
+                yield Item(topic, sequence, log_time, inside[at + _MESSAGE.size : at + length])
+        elif opcode == Opcode.CHANNEL:
+            channel = Channel.read(ReadDataStream(BytesIO(inside[at : at + length])))
+            names[channel.id] = channel.topic
+        at += length
 
 
 def _at_end(stream: IO[bytes]) -> bool:

@@ -7,6 +7,7 @@ vectors are FRD on both sides. The world's origin is the airframe's centre of ma
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -24,6 +25,14 @@ _ROTARY_DRAG_NM_PER_RAD_S = 0.01
 _CUT_M = 100.0  # longer than any servo winds up
 
 Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Pose:
+    """Where everything is, in MuJoCo's own terms: enough to draw it."""
+
+    qpos: Array
+    bar: Array  # (3,), m, MuJoCo's world
 
 
 class Plant:
@@ -122,6 +131,10 @@ class Plant:
             rate_b=(rate[0], rate[1], rate[2]),
             specific_force_b=_vec3(rotation.T @ acceleration),
         )
+
+    def pose(self) -> Pose:
+        """Where everything is now."""
+        return Pose(self._qpos.copy(), self._data.mocap_pos[0].copy())
 
     def tensions(self) -> tuple[float, ...]:
         """Tension in N of each tendon, as it acted during the last step."""

@@ -22,6 +22,7 @@ from arm_companion.record import open_recorder
 from arm_companion.record.recorder import Both, MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
+from arm_companion.sim.plant import Pose
 from arm_companion.sim.scenario import Operator, Say
 from arm_companion.sim.servo_emulator import EmulatedBus
 from arm_companion.sim.world import World
@@ -43,6 +44,7 @@ class Result:
     failure: str
     cycles: int = 0
     missed: int = 0
+    poses: list[Pose] = dataclasses.field(default_factory=list)
     records: list[Record] = dataclasses.field(default_factory=list)
 
 
@@ -97,7 +99,7 @@ async def fly_simulated(
         failure = await fly(Operator(link, config, flight, say))
         stop.set()
         await asyncio.sleep(0.5)
-    return Result(flight, failure, daemon.cycles, daemon.missed, memory.records)
+    return Result(flight, failure, daemon.cycles, daemon.missed, plant.poses, memory.records)
 
 
 def _model(config: Config) -> RodModel:
@@ -145,7 +147,7 @@ async def fly_real_time(
         failure = operator.result()
     if world.lost_s > 0.0:
         say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
-    return Result(flight, failure)
+    return Result(flight, failure, poses=world.poses)
 
 
 async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, stop: asyncio.Event) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.sim.autopilot import AutopilotStandIn
-from arm_companion.sim.plant import Plant
+from arm_companion.sim.plant import Plant, Pose
 from arm_companion.sim.ports import PlantTruth, RigidState
 from arm_companion.sim.servo_emulator import ServoEmulator
 
@@ -44,6 +44,9 @@ class World:
         self.servos = ServoEmulator(config.servos, config.sim.seed)
         self.samples: list[Sample] = []
         self.events: list[tuple[float, Callable[[World], None]]] = []
+        self.poses: list[Pose] = []
+        self.pose_every_s: float | None = None
+        """How often a pose is kept, for a film; None: never."""
         self.lost_s = 0.0  # real time that the physics could not keep up with
 
     def at(self, t: float, event: "Callable[[World], None]") -> None:
@@ -72,6 +75,8 @@ class World:
 
     def _advance(self) -> None:
         """One control period."""
+        if self.pose_every_s is not None and self.plant.time >= len(self.poses) * self.pose_every_s:
+            self.poses.append(self.plant.pose())
         while self.events and self.events[0][0] <= self.plant.time:
             self.events.pop(0)[1](self)
         config = self._config

@@ -99,16 +99,18 @@ def test_the_stock_reader_finds_every_channel_with_a_schema_that_fits(tmp_path: 
         topics = {channel.topic: channel for channel in summary.channels.values()}
         assert SCHEMAS.keys() < topics.keys()
         assert topics["/raw/mavlink/autopilot/sent"].message_encoding == "application/octet-stream"
-        seen = set()
+        seen, raw = set(), []
         for schema, channel, message in make_reader(stream).iter_messages():
             if channel.topic.startswith("/raw/"):
-                assert message.data == bytes(1500)
+                assert message.data == bytes(len(message.data))
+                raw.append(len(message.data))
                 continue
             assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("jsonschema", "json")
             fits(json.loads(message.data), json.loads(schema.data), channel.topic)
             seen.add(channel.topic)
     assert {FACTS, "/state", COMMANDS, LOG, TRANSITIONS, "/configuration"} <= seen
+    assert sum(raw) == 1500 * len(records()), "raw bytes are joined, and none is lost"
 
 
 def fits(value: object, schema: dict, where: str) -> None:

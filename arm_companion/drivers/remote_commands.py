@@ -1,4 +1,4 @@
-"""Commands over MQTT: nonce and age first, then exactly the way that a command over MAVLink goes."""
+"""Commands over MQTT and from the field page: nonce and age first, then exactly the way of a command over MAVLink."""
 
 import logging
 from collections import OrderedDict
@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Final, cast
 
 from arm_companion.clock import Clock
-from arm_companion.config.schema import MqttConfig
 from arm_companion.drivers.access import Sender
 from arm_companion.drivers.command_service import CommandService
 from arm_companion.drivers.commands import Command, is_ours
@@ -33,25 +32,34 @@ _RESULTS: Final = {
 _MOST_NONCES: Final = 1024
 
 
-class MqttCommands:
-    """Takes commands from the broker.
+class RemoteCommands:
+    """Takes commands from a side process.
 
     A nonce is good once: the same message again (QoS 1 repeats) gets the newest answer again and does nothing.
     Nonces are kept for as long as age alone would not refuse the command.
 
     Args:
-        config: which MAVLink system the commands count as, and how old they may be.
+        name: of the way that they come, for the log.
+        system: MAVLink system id that they count as.
         service: the command service that MAVLink's commands go to.
         clock: Unix time.
         answer: takes the answers.
+        age_s: how old a command may be.
     """
 
-    name = "mqtt"
-
     def __init__(
-        self, config: MqttConfig, service: CommandService, clock: Clock, answer: Callable[[Packet], None]
+        self,
+        name: str,
+        system: int,
+        service: CommandService,
+        clock: Clock,
+        answer: Callable[[Packet], None],
+        *,
+        age_s: float,
     ) -> None:
-        self._config = config
+        self.name = name
+        self._system = system
+        self._age_s = age_s
         self._service = service
         self._clock = clock
         self._answer = answer
@@ -62,17 +70,21 @@ class MqttCommands:
         self._reason = ""
 
     def take(self, payload: bytes) -> None:
-        """One message of the command topic."""
+        """One command as it came, unread."""
         try:
             order = read_order(payload)
         except ProtocolError as error:
-            log.warning("mqtt: a command is not understood: %s", error)
+            log.warning("%s: a command is not understood: %s", self.name, error)
             self._tell("", "", "denied", reason=f"not understood: {error}")
             return
+        self.give(order)
+
+    def give(self, order: Order) -> None:
+        """One well-formed command."""
         if self._repeated(order):
             return
         if (reason := self._refusal(order)) is not None:
-            log.info("mqtt: %s denied: %s", order.command[:32], reason)
+            log.info("%s: %s denied: %s", self.name, order.command[:32], reason)
             self._tell(order.nonce, order.command, "denied", reason=reason)
             return
         self._carry_out(order)
@@ -93,7 +105,7 @@ class MqttCommands:
 
     def _refusal(self, order: Order) -> str | None:
         """Why the order is not even looked at; None: it is, and its nonce is used up."""
-        now, limit = self._now(), self._config.command_age_s
+        now, limit = self._now(), self._age_s
         if order.time < self._started:
             return "it was given before this daemon started"
         if abs(age := now - order.time) > limit:
@@ -119,9 +131,9 @@ class MqttCommands:
     def _carry_out(self, order: Order) -> None:
         number = _NUMBERS[order.command]
         parameters = (*order.parameters, *(0.0,) * (7 - len(order.parameters)))
-        # the broker's own access lists and TLS stand for a signature; the configuration demands them
-        sender = Sender(self._config.command_system, _COMPONENT, "ground", ours=False, trusted=True)
-        log.info("mqtt: %s %s", order.command, list(order.parameters))
+        # whoever lets orders in here has seen to who sends them, which stands for a signature
+        sender = Sender(self._system, _COMPONENT, "ground", ours=False, trusted=True)
+        log.info("%s: %s %s", self.name, order.command, list(order.parameters))
         self._under_way[number] = order.nonce
         self._service.handle(Command(number, parameters, 0, sender), cast("MavlinkLink", self))
 

@@ -1,0 +1,64 @@
+"""The other end of `side_process`, for the process itself: lines in, lines out, and modest demands on the machine."""
+
+import asyncio
+import contextlib
+import json
+import os
+import resource
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from typing import Any, Final
+
+_LINE_LIMIT: Final = 1 << 20
+
+Take = Callable[[str, str], None]
+"""Takes topic and payload of one message."""
+Body = Callable[[dict[str, Any]], tuple[Take, Awaitable[None]]]
+"""Of the settings: what takes the daemon's messages, and the work that goes on meanwhile."""
+
+
+def tell(kind: str, text: str) -> None:
+    """One line for the daemon; when that is gone, we soon are, too."""
+    with contextlib.suppress(BrokenPipeError):
+        sys.stdout.write(json.dumps([kind, text]) + "\n")
+        sys.stdout.flush()
+
+
+def run(body: Body, most_memory: int) -> None:
+    """Serve until standard input ends or SIGTERM comes.
+
+    Args:
+        body: what this process is for.
+        most_memory: bytes of data that it may have.
+    """
+    with contextlib.suppress(OSError, ValueError):  # the unit's system calls may lack it
+        resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
+    with contextlib.suppress(OSError):
+        os.nice(5)
+    asyncio.run(_main(body))
+
+
+async def _main(body: Body) -> None:
+    lines = await _standard_input()
+    take, working = body(json.loads(await lines.readline() or "{}"))
+
+    async def read() -> None:
+        while line := await lines.readline():
+            take(*json.loads(line))
+
+    tasks = (asyncio.ensure_future(working), asyncio.create_task(read()))
+    for number in (signal.SIGTERM, signal.SIGINT):
+        asyncio.get_running_loop().add_signal_handler(number, tasks[0].cancel)
+    await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    for task in tasks:
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+
+async def _standard_input() -> asyncio.StreamReader:
+    reader = asyncio.StreamReader(limit=_LINE_LIMIT)
+    loop = asyncio.get_running_loop()
+    await loop.connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    return reader
