@@ -23,6 +23,7 @@ from arm_companion.config.flight_options import (
     SimBarConfig,
     SimConfig,
 )
+from arm_companion.config.grasp_options import GraspConfig, SimObjectConfig
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.config.mqtt_options import MqttConfig
 from arm_companion.config.options import section
@@ -37,6 +38,7 @@ __all__ = [
     "BackboneConfig",
     "CalibrationConfig",
     "Config",
+    "GraspConfig",
     "LimitsConfig",
     "LinkConfig",
     "MavlinkConfig",
@@ -49,6 +51,7 @@ __all__ = [
     "ServosConfig",
     "SimBarConfig",
     "SimConfig",
+    "SimObjectConfig",
     "VehicleConfig",
 ]
 
@@ -66,6 +69,7 @@ class Config:
     calibration: CalibrationConfig = section(CalibrationConfig)
     limits: LimitsConfig = section(LimitsConfig)
     perch: PerchConfig = section(PerchConfig)
+    grasp: GraspConfig = section(GraspConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)

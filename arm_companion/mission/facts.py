@@ -4,6 +4,7 @@ Frames: w world (NED), b body (FRD), a arm base. Quaternions are (w, x, y, z) an
 """
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -37,6 +38,7 @@ class VehicleState:
     heartbeat_age_s: float = float("inf")
     position_age_s: float = float("inf")
     attitude_age_s: float = float("inf")
+    thrust: float = math.nan  # share asked of the rotors, 0 to 1 along -z of the body; nan: not told lately
     clock_error_s: float = float("inf")  # greatest error of the ages, by TIMESYNC; inf: they count from the arrival
 
 
@@ -85,6 +87,7 @@ class Order(enum.Enum):
     READY = "ready"
     STOW = "stow"
     PERCH = "perch"
+    GRASP = "grasp"
     RELEASE = "release"
     ABORT = "abort"
     JOG = "jog"
