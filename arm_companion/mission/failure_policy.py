@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import hazards, perch
+from arm_companion.mission import grasp, hazards, perch
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -20,8 +20,9 @@ Guard = Callable[[Situation], str | None]
 SITUATIONS: dict[str, tuple[Phase, ...]] = {
     "at rest": (Phase.STARTUP, Phase.STOWED, Phase.READYING, Phase.READY, Phase.STOWING),
     "free flight": (Phase.APPROACH, Phase.REACH, Phase.DEPART),
-    "in contact": (Phase.CONTACT, Phase.WRAP, Phase.RELEASE),
+    "in contact": (Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE),
     "anchored": (Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
+    "carrying": (Phase.LIFT, Phase.CARRY, Phase.PLACE),
     "holding": (Phase.HOLDING,),
 }
 """Phases by what lies between arm, bar and vehicle. On the ground or in the air, an arm at rest does the same."""
@@ -62,7 +63,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "pilot takes the mode",
         ArmFault.PILOT_TOOK_OVER,
-        (hazards.pilot_takes_over,),
+        (hazards.pilot_takes_over, grasp.taken_over_while_setting_down),
         "no set-points; goes on with the arm alone",
     ),
     Cause(
@@ -127,15 +128,16 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "contact lost",
         ArmFault.CONTACT_LOST,
-        (perch.no_grip, perch.pull_test_failed, hazards.grip_lost),
+        (perch.no_grip, grasp.not_closed, perch.pull_test_failed, hazards.grip_lost, grasp.dropped),
         "cannot be told from letting go; a free arm has none",
     ),
     Cause("slip", ArmFault.SLIP, (hazards.grip_lost,), "not judged: the vehicle is not asked to stay, or not held yet"),
     Cause("no contact in time", ArmFault.NO_CONTACT, (perch.no_contact,), "does not apply"),
+    Cause("nothing below to set a load down on", ArmFault.NO_CONTACT, (grasp.nothing_below,), "does not apply"),
     Cause(
         "stiffness test failed",
         ArmFault.GRIP_TEST_FAILED,
-        (perch.pull_test_failed, perch.no_grip),
+        (perch.pull_test_failed, perch.no_grip, grasp.lift_failed, grasp.not_closed),
         "does not apply",
     ),
     Cause(
@@ -225,7 +227,7 @@ def cell(cause: Cause, situation: str) -> str:
 
 _HEADER = """# What happens when things go wrong
 
-Made from the tables in `arm_companion/mission/perch.py` and `notices.py`; a test fails when the two differ.
+Made from the tables in `arm_companion/mission/perch.py`, `grasp.py` and `notices.py`; a test fails when the two differ.
 
 - `→` names the state that follows, in the same cycle. Every change is told as STATUSTEXT with its reason, and a
   command that is running is answered with FAILED.
@@ -234,8 +236,9 @@ Made from the tables in `arm_companion/mission/perch.py` and `notices.py`; a tes
 - The pilot always wins: set-points stop in the cycle in which another mode is seen, in every state.
 - A grip that is tested is given up only by a person, by a limit that breaks (tension, wrench), or when it slips: a
   vehicle that hangs on an arm with a dead servo is better off than one that falls.
-- Hanging (arm above, motors idle) and carrying (a grasped object) do not exist in this version, so they have no
-  columns.
+- What is carried is never let go by itself: the arm holds, and a person decides. Only a load that is gone already
+  ends the carrying, in HOLDING.
+- Hanging (arm above, motors idle) does not exist in this version, so it has no column.
 
 """
 

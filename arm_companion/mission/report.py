@@ -6,9 +6,10 @@ from arm_companion.mission import actions, hazards
 from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Phase, Prediction
+from arm_companion.mission.state import CARRYING, Phase, Prediction
 
 _OVERLOAD = 0x20  # hardware-error bit of a servo
+_TOUCHES = CARRYING | frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD})
 _BEHAVIOUR = {
     Phase.STARTUP: "startup",
     Phase.STOWED: "stowed",
@@ -24,7 +25,7 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
     theta, delta = _polar(prediction.bend)
     goal_theta, goal_delta = _polar(s.state.bend)
     return StatusReport(
-        behaviour=_BEHAVIOUR.get(s.state.phase, "perch"),
+        behaviour=_BEHAVIOUR.get(s.state.phase, s.state.task.value),
         state=s.state.phase.name,
         state_number=s.state.phase.value,
         progress=actions.progress(s) if s.state.running else 255,
@@ -52,8 +53,8 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.SETPOINTS_SENT: actions.setpoint(s) is not None,
         ArmFlag.FEEDFORWARD: state.lean != ZERO
         or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
-        ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
-        ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
+        ArmFlag.TARGET_KNOWN: (s.facts.grasp_target if s.grasping else s.facts.bar) is not None,
+        ArmFlag.CONTACT: state.phase in _TOUCHES,
         ArmFlag.ANCHORED: state.phase is Phase.PERCHED,
     }
     return ArmFlag(sum(flag.value for flag, holds in held.items() if holds))

@@ -22,6 +22,7 @@ HOVER = VehicleState(
     heartbeat_age_s=0.3,
     position_age_s=0.01,
     attitude_age_s=0.01,
+    thrust=0.5,
 )
 
 

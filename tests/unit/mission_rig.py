@@ -9,15 +9,15 @@ from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Ord
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Phase, State
+from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, Anchor, Phase, State
 
 DT = 0.01
 T0 = 100.0
 PLACE = (2.0, 0.0, -2.2)
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
-HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING})
-"""Phases in which the arm is around the bar."""
+HELD = CARRYING | {Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}
+"""Phases in which the arm is around the bar, or around the object."""
 
 Change = Callable[[Facts], Facts]
 
@@ -37,6 +37,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "contact_w": PLACE,
         "anchor": ANCHOR if held else None,
         "tension": (8.0, 4.0, 1.0, 4.0),
+        "task": Order.GRASP if phase in CARRYING | {Phase.CLOSE} else Order.PERCH,
         "bend": bend,
         "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
     }
