@@ -15,17 +15,19 @@ from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
-_SCENARIOS = ("perch", "world")
+_CONFIGS = {"perch": "sim.toml", "grasp": "sim_grasp.toml", "world": "sim.toml"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion sim`."""
     parser.add_argument(
         "scenario",
-        choices=_SCENARIOS,
-        help="perch: take off, wrap a bar, be pulled, let go, land; world: no script, your own ground station flies",
+        choices=tuple(_CONFIGS),
+        help="perch: take off, wrap a bar, be pulled, let go, land; grasp: pick an object up and put it "
+        "back, without and with compensation, land; world: no script, your own ground station flies",
     )
-    add_config_arguments(parser, default="sim.toml")
+    add_config_arguments(parser, default="sim.toml, for grasp sim_grasp.toml")
+    parser.set_defaults(config=None)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
     parser.add_argument("--seed", type=int, metavar="N", help="of every random number in the world")
     parser.add_argument(
@@ -64,10 +66,11 @@ def _count(text: str) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the scenario; exit code 0 only when it perched and let go."""
-    if arguments.trials is not None and not (arguments.simulated and arguments.scenario == "perch"):
-        print("arm-companion sim: --trials flies the perch in simulated time: sim perch --simulated", file=sys.stderr)
+    """Fly the scenario; exit code 0 only when it did what it is for."""
+    if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
+        print("arm-companion sim: --trials flies in simulated time: sim perch|grasp --simulated", file=sys.stderr)
         return 2
+    arguments.config = arguments.config or _CONFIGS[arguments.scenario]
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
@@ -103,8 +106,8 @@ def _serve(arguments: argparse.Namespace, config: Config) -> int:
 
 def _fly(arguments: argparse.Namespace, config: Config) -> int:
     from arm_companion.sim.figure import draw  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.progress import Progress, show_verdict  # noqa: PLC0415
-    from arm_companion.sim.verdict import judge  # noqa: PLC0415
 
     output: Path = arguments.output
     started = time.perf_counter()
@@ -116,35 +119,43 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
-    verdict = judge(result.flight, result.failure)
-    figure = output / "perch.png"
-    draw(result.flight, config, f"Anchor perch: {verdict.verdict}", figure)
+    scenario = SCENARIOS[arguments.scenario]
+    verdict = scenario.judge(result.flight, result.failure, config)
+    figure = output / f"{arguments.scenario}.png"
+    draw(result.flight, config, f"{scenario.title}: {verdict.verdict}", figure)
     log = output / "events.log"
     start = result.flight.samples[0].t if result.flight.samples else 0.0
     log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
     _write_truth(arguments, result.flight)
-    show_verdict(verdict, progress.console, [figure, log, _record_path(arguments)])
+    show_verdict(scenario.title, verdict, progress.console, [figure, log, _record_path(arguments)])
     if arguments.json:
         wall = time.perf_counter() - started
-        print(json.dumps(_summary(verdict, result, wall)))
+        print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
     return 0 if verdict.success else 1
 
 
 def _trials(arguments: argparse.Namespace, config: Config) -> int:
-    from arm_companion.sim.progress import show_outcome, show_summary  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.sim.progress import show_outcome, show_summary  # noqa: PLC0415
     from arm_companion.sim.trials import fly  # noqa: PLC0415
 
     started = time.perf_counter()
     stream = sys.stderr if arguments.json else sys.stdout
     seeds = range(config.sim.seed, config.sim.seed + arguments.trials)
+    scenario = SCENARIOS[arguments.scenario]
     summary = fly(
-        arguments.config, arguments.settings, seeds, arguments.jobs, lambda outcome: show_outcome(outcome, stream)
+        arguments.config,
+        arguments.settings,
+        seeds,
+        arguments.jobs,
+        lambda outcome: show_outcome(outcome, scenario.done, stream),
+        arguments.scenario,
     )
-    show_summary(summary, stream)
+    show_summary(scenario.title, scenario.done, summary, stream)
     if arguments.json:
         low, high = summary.interval
         contract = {
-            "scenario": "perch",
+            "scenario": arguments.scenario,
             "success": summary.success,
             "trials": len(summary.outcomes),
             "failures": summary.failures,
@@ -174,18 +185,21 @@ def _record_path(arguments: argparse.Namespace) -> Path:
 
 def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments)))
+    fly = SCENARIOS[arguments.scenario].fly
+    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments), fly=fly))
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
+    from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
-    words = _daemon_words(arguments)
+    words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say, fly=fly))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:
@@ -196,13 +210,13 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
     return words
 
 
-def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
+def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
-    perched = next((w for w in verdict.wrench if w.span == "perched"), None)
+    perched = next((w for w in verdict.wrench if w.span in ("perched", "carried")), None)
     errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
-    return {
-        "scenario": "perch",
+    contract = {
+        "scenario": scenario,
         "verdict": verdict.verdict,
         "reason": verdict.reason,
         "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
@@ -215,6 +229,30 @@ def _summary(verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
         "missed_cycles": result.missed,
         "wall_s": round(wall_s, 3),
         "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
+    }
+    return contract | (_grasp_summary(verdict) if scenario == "grasp" else {})
+
+
+def _grasp_summary(verdict: Any) -> dict[str, Any]:
+    """What a grasp has besides: the errors are those of the height while the load came on, RMS."""
+    errors = {pick_up.name: pick_up.error_m for pick_up in verdict.pick_ups}
+    return {
+        "pose_error_with_m": _number(errors.get("grasp", math.nan)),
+        "pose_error_without_m": _number(errors.get("grasp, not compensated", math.nan)),
+        "pick_ups": [
+            {
+                "name": p.name,
+                "error_m": _number(p.error_m),
+                "aside_m": _number(p.aside_m),
+                "seconds": _number(p.seconds),
+            }
+            for p in verdict.pick_ups
+        ],
+        "payload_mass_kg": _number(verdict.weighed_kg),
+        "payload_mass_sigma_kg": _number(verdict.weighed_sigma_kg),
+        "payload_mass_true_kg": _number(verdict.mass_kg),
+        "payload_mass_error": _number(verdict.mass_error),
+        "placed_off_m": _number(verdict.placed_m),
     }
 
 

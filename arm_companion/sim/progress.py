@@ -8,6 +8,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.table import Table
 
+from arm_companion.sim.grasp_verdict import GraspVerdict
 from arm_companion.sim.trials import Outcome, Summary
 from arm_companion.sim.verdict import Verdict
 
@@ -29,9 +30,9 @@ class Progress:
         )
 
 
-def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
+def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Path]) -> None:
     """The table at the end, the verdict, and where to look further."""
-    table = Table(title="Anchor perch", title_justify="left", show_header=True, header_style="bold")
+    table = Table(title=title, title_justify="left", show_header=True, header_style="bold")
     table.add_column("what")
     table.add_column("value", justify="right")
     table.add_column("remark")
@@ -39,8 +40,8 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
         table.add_row(f"in {name}", f"{seconds:.1f} s", "")
     table.add_section()
     mean, most = verdict.contact_force_n
-    table.add_row("contact force while perched", f"{mean:.1f} N", f"greatest {most:.1f} N")
-    table.add_row("arm around the bar", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while perched")
+    table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
+    table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
     for wrench in verdict.wrench:
         table.add_row(
             f"wrench on airframe, {wrench.span}",
@@ -50,13 +51,16 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
             f"{wrench.predictions} predictions",
         )
     table.add_section()
-    table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
+    if not math.isnan(verdict.hover_error_m):
+        table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
     for move in verdict.moves:
         table.add_row(
             move.name,
             f"{_mm(move.made_m)} made",
             f"asked {_mm(move.asked_m)}, error {_mm(move.error_m)}, arm's force {move.force_n:.1f} N",
         )
+    if isinstance(verdict, GraspVerdict):
+        _show_grasp(verdict, table)
     console.print(table)
     style = "bold green" if verdict.success else "bold red"
     console.print(
@@ -69,23 +73,42 @@ def show_verdict(verdict: Verdict, console: Console, files: list[Path]) -> None:
             console.print(f"  {path}", soft_wrap=True)
 
 
-def show_outcome(outcome: Outcome, stream: TextIO) -> None:
+def _show_grasp(verdict: GraspVerdict, table: Table) -> None:
+    """What a grasp has besides."""
+    for pick_up in verdict.pick_ups:
+        table.add_row(
+            f"pick-up: {pick_up.name}",
+            f"{_mm(pick_up.error_m)} RMS",
+            f"from the height asked, at most {_mm(pick_up.worst_m)} too low; {_mm(pick_up.aside_m)} RMS aside; "
+            f"{pick_up.seconds:.1f} s",
+        )
+    if not math.isnan(verdict.weighed_kg):
+        table.add_row(
+            "object weighed",
+            f"{1e3 * verdict.weighed_kg:.0f} g",
+            f"one sigma {1e3 * verdict.weighed_sigma_kg:.0f} g; true {1e3 * verdict.mass_kg:.0f} g, "
+            f"error {verdict.mass_error:+.1%}",
+        )
+    table.add_row("object put down", _mm(verdict.placed_m), "from where it lay")
+
+
+def show_outcome(outcome: Outcome, done: str, stream: TextIO) -> None:
     """A line for one trial."""
-    what = "perched" if outcome.success else f"failed: {outcome.reason}"
+    what = done if outcome.success else f"failed: {outcome.reason}"
     print(f"seed {outcome.seed}: {what} ({outcome.words})", file=stream, flush=True)
 
 
-def show_summary(summary: Summary, stream: TextIO) -> None:
+def show_summary(title: str, done: str, summary: Summary, stream: TextIO) -> None:
     """How many of the trials succeeded, with the interval that the true share lies in, and why the others did not."""
     trials = len(summary.outcomes)
     low, high = summary.interval
-    table = Table(title=f"Anchor perch, {trials} trials", title_justify="left", show_header=True, header_style="bold")
+    table = Table(title=f"{title}, {trials} trials", title_justify="left", show_header=True, header_style="bold")
     table.add_column("what")
     table.add_column("trials", justify="right")
     table.add_column("share", justify="right")
     table.add_column("95 % interval (Wilson)", justify="right")
     share = f"{summary.success / trials:.0%}"
-    table.add_row("perched and let go", str(summary.success), share, f"{low:.0%} to {high:.0%}")
+    table.add_row(done, str(summary.success), share, f"{low:.0%} to {high:.0%}")
     table.add_row("harm: limit, airframe or fall", str(summary.harmed), f"{summary.harmed / trials:.0%}", "")
     table.add_section()
     for reason, count in summary.failures.items():

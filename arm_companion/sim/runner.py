@@ -6,9 +6,10 @@ import dataclasses
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from arm_companion.app import Daemon, Openers
 from arm_companion.arm import compiled
@@ -31,6 +32,7 @@ from arm_companion.transport.urls import open_url
 
 _STOP_WITHIN_S = 5.0
 Prepare = Callable[[World], None]
+Script = Callable[[Operator], Coroutine[Any, Any, str]]
 
 
 @dataclass(repr=False)  # asyncio's runner makes the text of a task's result, which here is a whole flight
@@ -55,8 +57,9 @@ async def fly_simulated(
     log: Path | None = None,
     *,
     world: Config | None = None,
+    fly: Script = Operator.fly_perch,
 ) -> Result:
-    """One perch on the running simulated loop: every part in this process, over in-memory pipes.
+    """One flight on the running simulated loop: every part in this process, over in-memory pipes.
 
     Args:
         config: the daemon's.
@@ -64,6 +67,7 @@ async def fly_simulated(
         prepare: changes the world before the flight.
         log: where the daemon's record goes.
         world: how the world is, where it differs from what the daemon believes.
+        fly: the operator's script.
     """
     companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
     plant = World(config if world is None else world)
@@ -90,7 +94,7 @@ async def fly_simulated(
         lambda: daemon.run(stop),
         link.run,
     ):
-        failure = await Operator(link, config, flight, say).fly_perch()
+        failure = await fly(Operator(link, config, flight, say))
         stop.set()
         await asyncio.sleep(0.5)
     return Result(flight, failure, daemon.cycles, daemon.missed, memory.records)
@@ -106,9 +110,15 @@ def _model(config: Config) -> RodModel:
 
 
 async def fly_real_time(
-    config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, prepare: Prepare = lambda _: None
+    config: Config,
+    daemon_arguments: Sequence[str],
+    log: Path,
+    say: Say,
+    prepare: Prepare = lambda _: None,
+    *,
+    fly: Script = Operator.fly_perch,
 ) -> Result:
-    """One perch in real time: UDP, a pty, and the daemon as in flight, in a process of its own.
+    """One flight in real time: UDP, a pty, and the daemon as in flight, in a process of its own.
 
     Args:
         config: the configuration that the daemon is given too.
@@ -116,6 +126,7 @@ async def fly_real_time(
         log: where the daemon's standard error goes.
         say: told what happens.
         prepare: changes the world before the flight.
+        fly: the operator's script.
     """
     world = World(config)
     prepare(world)
@@ -123,7 +134,7 @@ async def fly_real_time(
     sim = config.sim
     link = OperatorLink([open_url(sim.operator_autopilot_url), open_url(sim.operator_arm_url)])
     async with _in_real_time(world, config), _running(link.run), _daemon_process(daemon_arguments, log) as daemon:
-        operator = asyncio.create_task(Operator(link, config, flight, say).fly_perch())
+        operator = asyncio.create_task(fly(Operator(link, config, flight, say)))
         died = asyncio.create_task(daemon.wait())
         await asyncio.wait({operator, died}, return_when=asyncio.FIRST_COMPLETED)
         if not operator.done():

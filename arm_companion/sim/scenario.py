@@ -4,12 +4,12 @@ It sees what a ground station sees; the plant's truth is for the verdict alone.
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any
 
 from arm_companion.config.schema import Config
 from arm_companion.protocol.dialect import mav
-from arm_companion.sim.flight import Flight, Mark, TendonsSeen, Vec3, WrenchSeen
+from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight, Mark, PayloadSeen, TendonsSeen, Vec3, WrenchSeen
 from arm_companion.sim.operator_link import Address, OperatorLink
 
 Say = Callable[[str], None]
@@ -17,6 +17,7 @@ Say = Callable[[str], None]
 _PULL_M = 0.010
 _HOLD_S = 3.0
 _PULL_S = 4.0
+_CARRY_S = 4.0
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -61,6 +62,8 @@ class Operator:
                 )
             case "ARM_TENDONS":
                 flight.tendons.append(TendonsSeen(t, tuple(message.tension)))
+            case "ARM_PAYLOAD":
+                flight.payloads.append(PayloadSeen(t, message.mass, message.mass_sigma, bool(message.valid)))
             case "STATUSTEXT":
                 flight.texts.append((t, message.text))
                 if message.severity <= mav.MAV_SEVERITY_WARNING:
@@ -73,13 +76,23 @@ class Operator:
 
     async def fly_perch(self) -> str:
         """The whole flight. Returns why it failed, or an empty string."""
+        return await self._fly(self._perch, self._pull, self._release)
+
+    async def fly_grasp(self) -> str:
+        """An object is picked up twice, without and with the feed-forward, and put back each time."""
+        return await self._fly(self._grasp_uncompensated, self._ready, self._grasp)
+
+    async def fly_grasp_once(self) -> str:
+        """The same with the feed-forward alone, for trials."""
+        return await self._fly(self._grasp)
+
+    async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
         failure = ""
         try:
             await self._prepare()
             await self._take_off()
-            await self._perch()
-            await self._pull()
-            await self._release()
+            for act in acts:
+                await act()
         except (ScenarioFailed, TimeoutError) as error:
             failure = str(error) or "the operator waited too long"
             self._say(f"failed: {failure}")
@@ -145,18 +158,42 @@ class Operator:
         await self._jog((0.0, 0.0, 0.0))
         await asyncio.sleep(_PULL_S)
 
+    async def _grasp(self) -> None:
+        """Take the object, carry it for a while, and put it back."""
+        self._say("GRASP")
+        await self._pick_and_place(WITH)
+
+    async def _grasp_uncompensated(self) -> None:
+        self._say("GRASP, not compensated")
+        await self._compensate(on=False)
+        await self._pick_and_place(WITHOUT)
+        await self._compensate(on=True)
+
+    async def _ready(self) -> None:
+        await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
+
+    async def _pick_and_place(self, name: str) -> None:
+        start = asyncio.get_running_loop().time()
+        await self._order(mav.MAV_CMD_ARM_GRASP, "GRASP", 150.0)
+        self._mark(name, start)
+        await asyncio.sleep(1.0)
+        await self._measure(CARRIED, (0.0, 0.0, 0.0), _CARRY_S)
+        if self._state() != "CARRY":
+            raise ScenarioFailed(f"the carrying ended by itself in {self._state()}")
+        await self._release()
+
     async def _release(self) -> None:
         self._say("RELEASE")
-        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 90.0)
+        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
 
     async def _come_home(self) -> None:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
-        quiet = ("STOWED", "READY", "HOLDING", "")
-        await self._wait(lambda: self._state() in quiet, 90.0, f"the arm stays in {self._state()}")
-        if self._state() == "HOLDING":
-            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 60.0)
+        quiet = ("STOWED", "READY", "HOLDING", "CARRY", "")
+        await self._wait(lambda: self._state() in quiet, 150.0, f"the arm stays in {self._state()}")
+        if self._state() in ("HOLDING", "CARRY"):
+            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
         if self._state() == "READY":
             await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
         self._say("landing")
@@ -165,8 +202,8 @@ class Operator:
 
     # --- small things ---
 
-    async def _order(self, command: int, name: str, timeout_s: float) -> None:
-        result = await self._link.command(command, [0.0] * 7, target=self._arm, timeout=timeout_s)
+    async def _order(self, command: int, name: str, timeout_s: float, first: float = 0.0) -> None:
+        result = await self._link.command(command, [first, *[0.0] * 6], target=self._arm, timeout=timeout_s)
         if result != mav.MAV_RESULT_ACCEPTED:
             raise ScenarioFailed(f"{name}: {self._why(result)}")
 
@@ -201,10 +238,13 @@ class Operator:
             await asyncio.sleep(1.0)
 
     async def _measure(self, name: str, asked_w: Vec3, seconds: float) -> None:
-        loop = asyncio.get_running_loop()
-        start = loop.time()
+        start = asyncio.get_running_loop().time()
         await asyncio.sleep(seconds)
-        self._flight.marks.append(Mark(name, start, loop.time(), asked_w))
+        self._mark(name, start, asked_w)
+
+    def _mark(self, name: str, start: float, asked_w: Vec3 = (0.0, 0.0, 0.0)) -> None:
+        """Note what was asked from loop time `start` until now."""
+        self._flight.marks.append(Mark(name, start, asyncio.get_running_loop().time(), asked_w))
 
     async def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         try:

@@ -17,8 +17,8 @@ from statistics import NormalDist
 
 from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
+from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
-from arm_companion.sim.verdict import judge
 
 MODEL_ERROR = 0.1
 """Greatest relative difference between the plant and the controller's parameters."""
@@ -28,7 +28,9 @@ _BAR_TURNED_DEG = 20.0
 _BAR_ERROR_M = 0.01  # by how much what it is told is wrong, each axis
 _BAR_ERROR_DEG = 2.0
 _WIND_M_PER_S = 2.0
+_MASS_SHARE = (0.75, 1.5)  # of the configured object's
 _CONFIDENCE = 0.95
+_HARM = ("airframe", "did not land")
 _OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
 
 
@@ -173,29 +175,72 @@ def draw(config: Config, seed: int) -> Draw:
             ),
         ),
     )
+    if config.sim.object.mass_kg:
+        controller, world = (_with_object(one, config, _others(seed)) for one in (controller, world))
     words = ", ".join(f"{name} {100 * (value - 1):+.0f} %" for name, value in share.items())
+    name = "bar"
+    if (thing := world.sim.object).mass_kg:
+        told = [a - b for a, b in zip(controller.grasp.object_position_m, thing.position_m, strict=True)]
+        name = f"object of {1e3 * thing.mass_kg:.0f} g"
     error = "/".join(f"{1e3 * e:+.0f}" for e in told)
-    return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, bar told {error} mm off")
+    return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, {name} told {error} mm off")
 
 
-def fly_one(file: str, settings: tuple[str, ...], seed: int) -> Outcome:
+def _others(seed: int) -> random.Random:
+    """Numbers of a trial that are drawn for an object, apart from those that every trial draws."""
+    return random.Random(f"object {seed}")  # noqa: S311 - repeatable by design
+
+
+def _with_object(one: Config, config: Config, rng: random.Random) -> Config:
+    """The same object elsewhere and of another weight, both in the world and, with an error, in what is told of it.
+
+    Args:
+        one: configuration of the controller or of the world; both are drawn alike.
+        config: before anything was drawn.
+        rng: of this trial, afresh.
+    """
+    replace = dataclasses.replace
+    thing, grasp = config.sim.object, config.grasp
+    moved = [rng.uniform(-most, most) for most in _BAR_MOVED_M]
+    told = [rng.uniform(-_BAR_ERROR_M, _BAR_ERROR_M) for _ in range(3)]
+    turned, misread = rng.uniform(-_BAR_TURNED_DEG, _BAR_TURNED_DEG), rng.uniform(-_BAR_ERROR_DEG, _BAR_ERROR_DEG)
+    friction = thing.friction * (1.0 + rng.uniform(-MODEL_ERROR, MODEL_ERROR))
+    thing = replace(
+        thing,
+        mass_kg=thing.mass_kg * rng.uniform(*_MASS_SHARE),
+        friction=friction,
+        position_m=tuple(a + b for a, b in zip(thing.position_m, moved, strict=True)),
+        axis_deg=thing.axis_deg + turned,
+    )
+    grasp = replace(
+        grasp,
+        object_position_m=tuple(a + b + e for a, b, e in zip(grasp.object_position_m, moved, told, strict=True)),
+        object_axis_deg=grasp.object_axis_deg + turned + misread,
+    )
+    return replace(one, grasp=grasp, sim=replace(one.sim, object=thing))
+
+
+def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "perch") -> Outcome:
     """One trial in simulated time, in this process.
 
     Args:
         file: configuration, read anew because a read one does not travel between processes.
         settings: options that override it.
         seed: of the trial.
+        scenario: which flight.
 
     Raises:
         ConfigError: the configuration cannot be used.
     """
     config = load(file, settings, os.environ)
     drawn = draw(config, seed)
-    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world))
-    verdict = judge(result.flight, result.failure)
+    script = SCENARIOS[scenario]
+    fly = script.fly_trial or script.fly
+    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=fly))
+    verdict = script.judge(result.flight, result.failure, drawn.world)
     samples = result.flight.samples
     most = max((max(sample.truth.tension) for sample in samples), default=0.0)
-    harm = [reason for reason in verdict.reason.split("; ") if "airframe touched" in reason or "did not land" in reason]
+    harm = [reason for reason in verdict.reason.split("; ") if any(word in reason for word in _HARM)]
     if most > _OVER * config.limits.tension_max_n:
         harm.append(f"a tendon carried {most:.1f} N")
     return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words)
@@ -207,6 +252,7 @@ def fly(
     seeds: Sequence[int],
     jobs: int,
     told: Callable[[Outcome], None] = lambda _: None,
+    scenario: str = "perch",
 ) -> Summary:
     """All trials, each in a process of `jobs`.
 
@@ -216,6 +262,7 @@ def fly(
         seeds: one for each trial.
         jobs: processes that fly at the same time.
         told: called with each outcome as it comes, in any order.
+        scenario: which flight.
 
     Raises:
         BrokenProcessPool: a process died.
@@ -223,7 +270,7 @@ def fly(
     spawn = multiprocessing.get_context("spawn")
     outcomes: list[Outcome] = []
     with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
-        waiting = [pool.submit(fly_one, file, tuple(settings), seed) for seed in seeds]
+        waiting = [pool.submit(fly_one, file, tuple(settings), seed, scenario) for seed in seeds]
         try:
             for done in as_completed(waiting):
                 outcomes.append(done.result())

@@ -2,6 +2,7 @@
 
 import math
 import statistics
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from arm_companion.sim.flight import Flight, Mark, WrenchSeen
@@ -68,17 +69,15 @@ def judge(flight: Flight, failure: str) -> Verdict:
         reasons.append("never perched")
     elif held < _HELD_SHARE:
         reasons.append(f"the arm held the bar only {held:.0%} of the time it said so")
-    reasons += _after(flight, bool(perched))
-    reasons += _unharmed(flight)
+    reasons += after(flight, perched=bool(perched))
+    reasons += unharmed(flight)
     verdict = Verdict(not reasons, "perched" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
     verdict.states = [(name, end - start) for name, start, end in spans]
     if perched:
         forces = [s.truth.contact_force_n for s in perched]
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))
         verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in perched)
-    for name in ("free", "perched"):
-        if (error := _wrench_error(flight, name, spans)) is not None:
-            verdict.wrench.append(error)
+    verdict.wrench = wrench_errors(flight, {"free": ("READY", "APPROACH", "DEPART"), "perched": ("PERCHED",)})
     still = next((mark for mark in flight.marks if mark.name == "hold"), None)
     if still is not None:
         verdict.hover_error_m = _spread(flight.within(still.start, still.end))
@@ -94,7 +93,7 @@ def _held(perched: list[Sample]) -> float:
     return sum(good) / len(good)
 
 
-def _after(flight: Flight, perched: bool) -> list[str]:
+def after(flight: Flight, *, perched: bool) -> list[str]:
     """What is wrong with the end: still at the bar, or not on the ground."""
     if not flight.samples:
         return ["nothing was measured"]
@@ -110,7 +109,7 @@ def _after(flight: Flight, perched: bool) -> list[str]:
     return reasons
 
 
-def _unharmed(flight: Flight) -> list[str]:
+def unharmed(flight: Flight) -> list[str]:
     """What must never happen: the airframe touches bar or ground while it flies."""
     touching = [s for s in flight.samples if s.state.position_w[2] < -_AIRBORNE_M and s.truth.body_contact]
     if not touching:
@@ -118,11 +117,19 @@ def _unharmed(flight: Flight) -> list[str]:
     return [f"the airframe touched something in flight at {touching[0].t - flight.samples[0].t:.1f} s"]
 
 
-def _wrench_error(flight: Flight, name: str, spans: list[tuple[str, float, float]]) -> WrenchError | None:
-    inside = [(a, b) for state, a, b in spans if (state == "PERCHED") == (name == "perched") and b > a]
-    free = {"READY", "APPROACH", "DEPART"}
-    if name == "free":
-        inside = [(a, b) for state, a, b in spans if state in free]
+def wrench_errors(flight: Flight, kinds: Mapping[str, Sequence[str]]) -> list[WrenchError]:
+    """The error of the prediction in each kind of span that has any.
+
+    Args:
+        flight: what was seen.
+        kinds: name of the kind -> the states that it consists of.
+    """
+    found = (_wrench_error(flight, name, states) for name, states in kinds.items())
+    return [error for error in found if error is not None]
+
+
+def _wrench_error(flight: Flight, name: str, states: Sequence[str]) -> WrenchError | None:
+    inside = [(start, end) for state, start, end in flight.spans() if state in states and end > start]
     pairs: list[tuple[WrenchSeen, Sample]] = []
     for seen in flight.wrenches:
         sample = flight.sample_at(seen.t)

@@ -1,0 +1,41 @@
+"""Which script the operator flies in each scenario, and who judges the flight."""
+
+from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from arm_companion.config.schema import Config
+from arm_companion.sim.flight import Flight
+from arm_companion.sim.grasp_verdict import judge_grasp
+from arm_companion.sim.scenario import Operator
+from arm_companion.sim.verdict import Verdict, judge
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """One flight with a script.
+
+    Attributes:
+        title: for people.
+        done: what a success is called.
+        fly: what the operator does; gives why it failed, or an empty string.
+        judge: the verdict on a flight, with the script's failure and the world as it was.
+        fly_trial: what the operator does in a trial, where that is shorter.
+    """
+
+    title: str
+    done: str
+    fly: Callable[[Operator], Coroutine[Any, Any, str]]
+    judge: Callable[[Flight, str, Config], Verdict]
+    fly_trial: Callable[[Operator], Coroutine[Any, Any, str]] | None = None
+
+
+SCENARIOS: Mapping[str, Scenario] = {
+    "perch": Scenario(
+        "Anchor perch",
+        "perched and let go",
+        Operator.fly_perch,
+        lambda flight, failure, _: judge(flight, failure),
+    ),
+    "grasp": Scenario("Grasp", "grasped and put back", Operator.fly_grasp, judge_grasp, Operator.fly_grasp_once),
+}
