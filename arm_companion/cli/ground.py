@@ -34,7 +34,7 @@ _CODES: Final = """exit codes:
 _ORDERS: Final = {
     "ready": "torque on, pretension, straight",
     "perch": "perch on the bar; ends when the grip is verified, or when the vehicle hangs",
-    "grasp": "grasp the object",
+    "grasp": "grasp the object; ends when it is carried",
     "release": "let go and clear what was held",
     "stow": "straighten the arm",
     "abort": "leave whatever runs on its shortest safe way",
@@ -64,10 +64,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for name, text in _ORDERS.items():
         order = add(name, text)
         if name == "perch":
-            _bar(order)
+            _target(order, "bar", "a point on its axis")
             order.add_argument(
                 "--hang", action="store_true", help="hang from the bar with idle motors, by an arm above the vehicle"
             )
+        if name == "grasp":
+            _target(order, "object", "the middle of its axis")
     _jog(add("jog", "bend the free arm from the keyboard or by numbers, or move the anchored vehicle"))
     control = add("control", "take primary control, so that other stations may only stow and abort, or give it up")
     control.add_argument("verb", choices=("take", "release", "take-over"))
@@ -157,6 +159,9 @@ def _wrong_usage(arguments: argparse.Namespace) -> str:
         case "perch":
             together = {arguments.bar is None, arguments.bar_axis_deg is None, arguments.bar_radius is None}
             return "" if len(together) == 1 else "--bar, --bar-axis-deg and --bar-radius belong together"
+        case "grasp":
+            together = {arguments.object is None, arguments.object_axis_deg is None, arguments.object_radius is None}
+            return "" if len(together) == 1 else "--object, --object-axis-deg and --object-radius belong together"
         case "jog" if arguments.theta_deg is None and arguments.vehicle is None and not sys.stdin.isatty():
             return "the keyboard needs a terminal; without one give --theta-deg or --vehicle"
     return ""
@@ -200,16 +205,16 @@ def _seconds(parser: argparse.ArgumentParser, default: float | None = None) -> N
     parser.add_argument("--seconds", type=_positive, metavar="S", default=default, help=text)
 
 
-def _bar(parser: argparse.ArgumentParser) -> None:
+def _target(parser: argparse.ArgumentParser, name: str, point: str) -> None:
     parser.add_argument(
-        "--bar",
+        f"--{name}",
         type=float,
         nargs=3,
         metavar=("N", "E", "D"),
-        help="first tell where the bar is: a point on its axis, m, in the autopilot's local frame",
+        help=f"first tell where the {name} is: {point}, m, in the autopilot's local frame",
     )
-    parser.add_argument("--bar-axis-deg", type=float, metavar="DEG", help="its heading; it is level")
-    parser.add_argument("--bar-radius", type=_positive, metavar="M", help="its radius")
+    parser.add_argument(f"--{name}-axis-deg", type=float, metavar="DEG", help="its heading; it is level")
+    parser.add_argument(f"--{name}-radius", type=_positive, metavar="M", help="its radius")
 
 
 def _jog(parser: argparse.ArgumentParser) -> None:

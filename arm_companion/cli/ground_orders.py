@@ -132,26 +132,36 @@ def _order(name: str) -> Action:
         if name == "abort":
             return await follow(arguments, arm, "ABORT", arm.abort(timeout=arguments.timeout))
         if name == "perch" and arguments.bar is not None:
-            await _target(arguments, arm)
+            heading = math.radians(arguments.bar_axis_deg)
+            axis = (math.cos(heading), math.sin(heading), 0.0)
+            north, east, down = arguments.bar
+            await _target(arm, arm.target_bar((north, east, down), axis, arguments.bar_radius), flag=True)
         if name == "perch" and arguments.hang:
             hang = arm.perch(mav.ARM_PERCH_KIND_HANG, progress=progress, timeout=arguments.timeout)
             return await follow(arguments, arm, "PERCH", hang)
+        if name == "grasp" and arguments.object is not None:
+            heading = math.radians(arguments.object_axis_deg)
+            north, east, down = arguments.object
+            await _target(arm, arm.target_object((north, east, down), heading, arguments.object_radius), flag=False)
         method: Callable[..., Awaitable[None]] = getattr(arm, name)
         return await follow(arguments, arm, name.upper(), method(progress=progress, timeout=arguments.timeout))
 
     return action
 
 
-async def _target(arguments: argparse.Namespace, arm: Arm) -> None:
-    """Tell where the bar is, and see it taken.
+async def _target(arm: Arm, tell_target: Awaitable[None], *, flag: bool) -> None:
+    """Tell where bar or object is, and see it taken.
+
+    Args:
+        arm: that is told.
+        tell_target: sends it.
+        flag: whether the arm shows that it knows it before it is ordered there, as it does of a bar.
 
     Raises:
         ArmError: it is refused, or nothing shows that it has been taken.
     """
-    heading = math.radians(arguments.bar_axis_deg)
-    north, east, down = arguments.bar
-    await arm.target_bar((north, east, down), (math.cos(heading), math.sin(heading), 0.0), arguments.bar_radius)
     said = len(arm.texts)
+    await tell_target
 
     def refusal() -> str:
         return next((t.text for t in list(arm.texts)[said:] if t.text.startswith("target refused")), "")
@@ -162,7 +172,8 @@ async def _target(arguments: argparse.Namespace, arm: Arm) -> None:
     # A refusal comes at once; the flag may be that of an earlier target, so that a refusal is waited for anyway.
     with contextlib.suppress(ArmSilent):
         await arm.channel.wait_for(lambda: bool(refusal()), 0.5, "")
-    await arm.channel.wait_for(answered, _TARGET_S, "the arm does not show that it has taken the bar")
+    if flag:
+        await arm.channel.wait_for(answered, _TARGET_S, "the arm does not show that it has taken the bar")
     if refusal():
         raise ArmError(refusal())
 

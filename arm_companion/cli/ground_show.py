@@ -33,7 +33,7 @@ async def _status(arguments: argparse.Namespace, arm: Arm) -> int:
             await arm.first(kind, arguments.timeout or _FIRST_S)
         except ArmSilent:
             missing.append(kind.MESSAGE)
-    reports = {"status": arm.status, "tendons": arm.tendons, "wrench": arm.wrench}
+    reports = {"status": arm.status, "tendons": arm.tendons, "wrench": arm.wrench, "payload": arm.payload}
     facts: dict[str, Any] = {"system": arm.system, "component": arm.channel.component, "way": arm.way}
     facts |= {name: None if report is None else as_json(report) for name, report in reports.items()}
     tell(arguments, **facts)

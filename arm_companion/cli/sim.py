@@ -15,7 +15,7 @@ from arm_companion.cli.common import add_config_arguments, add_live_argument, lo
 from arm_companion.config import Config
 from arm_companion.errors import ArmError
 
-_CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "world": "sim.toml"}
+_CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "grasp": "sim_grasp.toml", "world": "sim.toml"}
 _FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
@@ -25,9 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenario",
         choices=tuple(_CONFIGS),
         help="perch: take off, wrap a bar, be pulled, let go, land; hang: wrap a bar overhead, hang with idle motors, "
-        "let go, land; world: no script, your own ground station flies",
+        "let go, land; grasp: pick an object up and put it back, without and with compensation, land; world: no "
+        "script, your own ground station flies",
     )
-    add_config_arguments(parser, default="sim.toml, for hang sim_hang.toml")
+    add_config_arguments(parser, default="sim.toml, for hang and grasp sim_hang.toml and sim_grasp.toml")
     parser.set_defaults(config=None)
     add_live_argument(parser)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
@@ -74,9 +75,9 @@ def _count(text: str) -> int:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Fly the scenario; exit code 0 only when it perched, or hung, and let go."""
+    """Fly the scenario; exit code 0 only when it did what it is for."""
     if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
-        print("arm-companion sim: --trials flies in simulated time: sim perch|hang --simulated", file=sys.stderr)
+        print("arm-companion sim: --trials flies in simulated time: sim perch|hang|grasp --simulated", file=sys.stderr)
         return 2
     if arguments.live is not None and arguments.simulated:
         print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
@@ -265,10 +266,10 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
 
 def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
-    perched = next((w for w in verdict.wrench if w.span in ("perched", "hanging")), None)
+    perched = next((w for w in verdict.wrench if w.span in ("perched", "hanging", "carried")), None)
     errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
-    return {
+    contract = {
         "scenario": scenario,
         "verdict": verdict.verdict,
         "reason": verdict.reason,
@@ -282,6 +283,30 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "missed_cycles": result.missed,
         "wall_s": round(wall_s, 3),
         "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
+    }
+    return contract | (_grasp_summary(verdict) if scenario == "grasp" else {})
+
+
+def _grasp_summary(verdict: Any) -> dict[str, Any]:
+    """What a grasp has besides: the errors are those of the height while the load came on, RMS."""
+    errors = {pick_up.name: pick_up.error_m for pick_up in verdict.pick_ups}
+    return {
+        "pose_error_with_m": _number(errors.get("grasp", math.nan)),
+        "pose_error_without_m": _number(errors.get("grasp, not compensated", math.nan)),
+        "pick_ups": [
+            {
+                "name": p.name,
+                "error_m": _number(p.error_m),
+                "aside_m": _number(p.aside_m),
+                "seconds": _number(p.seconds),
+            }
+            for p in verdict.pick_ups
+        ],
+        "payload_mass_kg": _number(verdict.weighed_kg),
+        "payload_mass_sigma_kg": _number(verdict.weighed_sigma_kg),
+        "payload_mass_true_kg": _number(verdict.mass_kg),
+        "payload_mass_error": _number(verdict.mass_error),
+        "placed_off_m": _number(verdict.placed_m),
     }
 
 

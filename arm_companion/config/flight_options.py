@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from arm_companion.config.grasp_options import SimObjectConfig
 from arm_companion.config.options import option, section
 
 
@@ -146,6 +147,12 @@ class SimConfig:
     seed: int = option("of every random number in the world", 1, lower=0, upper=2**31 - 1)
     step_s: float = option("physics step", 0.001, unit="s", lower=1e-4, upper=0.004)
     takeoff_height_m: float = option("height of the take-off", 2.2, unit="m", lower=0.5, upper=50.0)
+    thrust_curve: float = option(
+        "how far rotor thrust is from linear in the commanded share (PX4: THR_MDL_FAC that nobody set)",
+        0.3,
+        lower=0.0,
+        upper=0.9,
+    )
     position_noise_m: float = option("estimator noise, one sigma", 0.004, unit="m", lower=0.0, upper=1.0)
     wind_m_per_s: tuple[float, ...] = option(
         "steady wind, NED", (0.0, 0.0, 0.0), unit="m/s", lower=-30.0, upper=30.0, length=3
@@ -154,3 +161,4 @@ class SimConfig:
     operator_autopilot_url: str = option("where the operator hears the autopilot", "udpin:127.0.0.1:14550")
     operator_arm_url: str = option("where the operator hears the daemon", "udpin:127.0.0.1:14560")
     bar: SimBarConfig = section(SimBarConfig)
+    object: SimObjectConfig = section(SimObjectConfig)

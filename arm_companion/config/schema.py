@@ -23,6 +23,7 @@ from arm_companion.config.flight_options import (
     SimBarConfig,
     SimConfig,
 )
+from arm_companion.config.grasp_options import GraspConfig, SimObjectConfig
 from arm_companion.config.hang_options import HangConfig
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.config.mqtt_options import MqttConfig
@@ -39,6 +40,7 @@ __all__ = [
     "BackboneConfig",
     "CalibrationConfig",
     "Config",
+    "GraspConfig",
     "HangConfig",
     "LimitsConfig",
     "LinkConfig",
@@ -53,6 +55,7 @@ __all__ = [
     "ServosConfig",
     "SimBarConfig",
     "SimConfig",
+    "SimObjectConfig",
     "VehicleConfig",
 ]
 
@@ -71,6 +74,7 @@ class Config:
     limits: LimitsConfig = section(LimitsConfig)
     perch: PerchConfig = section(PerchConfig)
     hang: HangConfig = section(HangConfig)
+    grasp: GraspConfig = section(GraspConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)

@@ -26,12 +26,14 @@ log = logging.getLogger(__name__)
 HEARTBEAT: Final = mav.MAVLINK_MSG_ID_HEARTBEAT
 ATTITUDE: Final = mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
 POSITION: Final = mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED
+THRUST: Final = mav.MAVLINK_MSG_ID_ATTITUDE_TARGET
 LANDED: Final = mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE
 THROTTLE: Final = mav.MAVLINK_MSG_ID_VFR_HUD
 ACK: Final = mav.MAVLINK_MSG_ID_COMMAND_ACK
 
 LANDED_RATE_HZ: Final = 5.0
 THROTTLE_RATE_HZ: Final = 10.0
+THRUST_RATE_HZ: Final = 50.0
 CHECK_PERIOD_S: Final = 1.0
 """How often the arriving rates are held against the asked ones."""
 
@@ -86,6 +88,7 @@ class Autopilot:
         self._rates = {
             ATTITUDE: vehicle.state_rate_hz,
             POSITION: vehicle.state_rate_hz,
+            THRUST: THRUST_RATE_HZ,
             LANDED: LANDED_RATE_HZ,
             THROTTLE: THROTTLE_RATE_HZ,
         }
@@ -98,7 +101,7 @@ class Autopilot:
         self._check_now = asyncio.Event()
         self._mismatch_told = False
         self._reset()
-        link.subscribe(self._on_message, (HEARTBEAT, ATTITUDE, POSITION, LANDED, THROTTLE, ACK))
+        link.subscribe(self._on_message, (HEARTBEAT, ATTITUDE, POSITION, THRUST, LANDED, THROTTLE, ACK))
 
     def _reset(self) -> None:
         self._heartbeat: Message | None = None
@@ -107,6 +110,8 @@ class Autopilot:
         self._rate: Vec3 = (0.0, 0.0, 0.0)
         self._position: Vec3 = (0.0, 0.0, 0.0)
         self._velocity: Vec3 = (0.0, 0.0, 0.0)
+        self._thrust = math.nan
+        self._thrust_at = float("-inf")
         self._landed = True
         self._throttle, self._throttle_at = 0.0, float("-inf")
 
@@ -142,6 +147,7 @@ class Autopilot:
             attitude_age_s=now - self._attitude_at,
             throttle=self._throttle,
             throttle_age_s=now - self._throttle_at,
+            thrust=self._thrust if now - self._thrust_at <= self._config.state_timeout_s else math.nan,
             clock_error_s=float("inf") if self._timesync is None else self._timesync.error_s,
         )
 
@@ -237,6 +243,8 @@ class Autopilot:
                 self._on_attitude(message, now)
             case mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
                 self._on_position(message, now)
+            case mav.MAVLINK_MSG_ID_ATTITUDE_TARGET:
+                self._on_thrust(message, now)
             case mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE:
                 self._arrived[LANDED] += 1
                 if message.landed_state != mav.MAV_LANDED_STATE_UNDEFINED:
@@ -288,6 +296,13 @@ class Autopilot:
         if self._arrival(POSITION, m.time_boot_ms):
             self._position, self._velocity = position, velocity
             self._position_at = self._measured_at(m.time_boot_ms, now)
+
+    def _on_thrust(self, m: Message, now: float) -> None:
+        if not 0.0 <= m.thrust <= 1.0:
+            self.counters.invalid += 1
+            return
+        if self._arrival(THRUST, m.time_boot_ms):
+            self._thrust, self._thrust_at = m.thrust, now
 
     def _measured_at(self, boot_ms: int, now: float) -> float:
         """Loop time of a state: by its own stamp where the clocks are tied together, else its arrival."""

@@ -7,7 +7,7 @@ from arm_companion.ground.arm import DEFAULT_URL, Arm
 from arm_companion.ground.channel import ArmSilent
 from arm_companion.ground.commands import CommandFailed, CommandUnfinished
 from arm_companion.ground.parameters import Parameter, ParameterRefused
-from arm_companion.ground.reports import Report, Status, Tendon, Tendons, Wrench
+from arm_companion.ground.reports import Payload, Report, Status, Tendon, Tendons, Wrench
 from arm_companion.ground.texts import Text
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "CommandUnfinished",
     "Parameter",
     "ParameterRefused",
+    "Payload",
     "Report",
     "Status",
     "Tendon",

@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar, overload
 from arm_companion.ground.channel import SILENT_S, Address, ArmSilent, Channel
 from arm_companion.ground.commands import Commander, Progress
 from arm_companion.ground.parameters import ParameterClient
-from arm_companion.ground.reports import REPORTS, Report, Status, Tendons, Vector, Wrench
+from arm_companion.ground.reports import REPORTS, Kind, Payload, Report, Status, Tendons, Vector, Wrench
 from arm_companion.ground.texts import Sentences, Text
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
@@ -25,12 +25,14 @@ _GOALS: Final = {
     mav.MAV_CMD_ARM_READY: ("READY",),
     mav.MAV_CMD_ARM_STOW: ("STOWED",),
     mav.MAV_CMD_ARM_PERCH: ("PERCHED", "HANGING"),
+    mav.MAV_CMD_ARM_GRASP: ("CARRY",),
     mav.MAV_CMD_ARM_RELEASE: ("STOWED",),
 }
 """States that end a command; ARM_STATUS tells of them when the final answer gets lost."""
 
 T = TypeVar("T", bound=Report | Text)
 _UNKNOWN: Final = math.nan
+_CARRIED_S: Final = 3.0  # three times the period of ARM_PAYLOAD
 
 
 class Arm:
@@ -134,7 +136,12 @@ class Arm:
             return None
         return Tendons(max(g.time for g in groups), tuple(tendon for g in groups for tendon in g.tendons))
 
-    def age(self, kind: type[Status] | type[Wrench] | type[Tendons]) -> float:
+    @property
+    def payload(self) -> Payload | None:
+        """The newest ARM_PAYLOAD, None when none has come lately: it is sent while something is carried."""
+        return self._newest(Payload) if self.age(Payload) <= _CARRIED_S else None
+
+    def age(self, kind: Kind) -> float:
         """Seconds since the newest report of a kind, infinite before the first."""
         entry = self._latest.get(kind)
         return math.inf if entry is None else asyncio.get_running_loop().time() - entry[0]
@@ -158,7 +165,7 @@ class Arm:
     def stream(self, *kinds: type[T], depth: int = 1000, patient: bool = False) -> AsyncIterator[T]: ...
 
     async def stream(self, *kinds: type[Any], depth: int = 1000, patient: bool = False) -> AsyncIterator[Any]:
-        """Every report from now on, of `Status`, `Wrench`, `Tendons` or `Text`; all of them when none is named.
+        """Every report from now on, of `Status`, `Wrench`, `Tendons`, `Payload` or `Text`; all when none is named.
 
         Ends with the connection's `async with` block at the latest.
 
@@ -171,7 +178,7 @@ class Arm:
             ArmSilent: no heartbeat for five seconds, unless `patient`.
         """
         queue: asyncio.Queue[Any] = asyncio.Queue(depth)
-        entry = (kinds or (Status, Wrench, Tendons, Text), queue)
+        entry = (kinds or (Status, Wrench, Tendons, Payload, Text), queue)
         self._streams.append(entry)
         try:
             while True:
@@ -206,7 +213,7 @@ class Arm:
         await self.order(mav.MAV_CMD_ARM_PERCH, kind, progress=progress, timeout=timeout)
 
     async def grasp(self, progress: Progress | None = None, timeout: float | None = None) -> None:  # noqa: ASYNC109
-        """Grasp the object that `target_object` told of."""
+        """Grasp the object that `target_object` told of, or the configured one; ends when it is carried."""
         await self.order(mav.MAV_CMD_ARM_GRASP, progress=progress, timeout=timeout)
 
     async def release(self, progress: Progress | None = None, timeout: float | None = None) -> None:  # noqa: ASYNC109
@@ -264,7 +271,7 @@ class Arm:
         goals = _GOALS.get(command, ())
         await self._commander.run(command, parameters, goals=goals, progress=progress, timeout=timeout)
 
-    async def set_rate(self, report: type[Status] | type[Wrench] | type[Tendons], hertz: float) -> None:
+    async def set_rate(self, report: Kind, hertz: float) -> None:
         """Ask for another rate of a report on this connection; 0 stops it.
 
         Raises:
@@ -308,6 +315,24 @@ class Arm:
         await self.channel.send(
             mav.MAVLink_arm_target_message,
             *(self._stamp(), kind, frame, list(position), list(axis), unknown[0], radius, unknown[1], _UNKNOWN),
+        )
+
+    async def target_object(self, position: Vector, axis_rad: float, radius: float) -> None:
+        """Tell where the object is (ARM_TARGET). No acknowledgement; a refusal comes as a text.
+
+        Args:
+            position: middle of the part to wrap, m, the autopilot's local NED.
+            axis_rad: heading of its axis, clockwise from north; it is level.
+            radius: to wrap around, m.
+
+        Raises:
+            ArmSilent: the arm has not been heard.
+        """
+        kind, frame = mav.ARM_TARGET_KIND_OBJECT, mav.MAV_FRAME_LOCAL_NED
+        q = [math.cos(axis_rad / 2.0), 0.0, 0.0, math.sin(axis_rad / 2.0)]  # its x axis is the one to wrap around
+        await self.channel.send(
+            mav.MAVLink_arm_target_message,
+            *(self._stamp(), kind, frame, list(position), [_UNKNOWN] * 3, q, radius, [_UNKNOWN] * 6, _UNKNOWN),
         )
 
     # Inside --------------------

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Any, Final, TextIO, TypeAlias
 
 from arm_companion.errors import ProtocolError
-from arm_companion.ground.reports import REPORTS, Report, Status, Tendon, Tendons, Wrench, as_json
+from arm_companion.ground.reports import REPORTS, Payload, Report, Status, Tendon, Tendons, Wrench, as_json
 from arm_companion.ground.texts import Text
 
 Entry: TypeAlias = Report | Text
 
 FORMATS: Final = ("jsonl", "csv")
 _AXES: Final = ("x", "y", "z")
-_VECTORS: Final = frozenset({"tip_position", "force", "torque", "force_sigma", "torque_sigma"})
+_VECTORS: Final = frozenset({"tip_position", "force", "torque", "force_sigma", "torque_sigma"}) | frozenset(
+    {"centre_of_mass", "centre_of_mass_sigma"}
+)
 _TEXT: Final = "STATUSTEXT"
 
 
@@ -94,7 +96,7 @@ def _from_json(fields: dict[str, Any]) -> Entry:
     if name == Status.MESSAGE:
         progress = fields.pop("progress")
         return Status(**_known(fields), progress=progress)
-    return Wrench(**_known(fields))
+    return Payload(**_known(fields)) if name == Payload.MESSAGE else Wrench(**_known(fields))
 
 
 def _known(fields: dict[str, Any]) -> dict[str, Any]:
@@ -111,7 +113,7 @@ def _number(value: Any) -> Any:
 
 def _columns() -> list[str]:
     columns = ["received", "message", "time"]
-    for kind in (Status, Wrench, Tendon, Text):
+    for kind in (Status, Wrench, Tendon, Text, Payload):
         for field in dataclasses.fields(kind):
             names = [f"{field.name}_{axis}" for axis in _AXES] if field.name in _VECTORS else [field.name]
             columns += [name for name in names if name not in columns]

@@ -133,11 +133,36 @@ class Tendons:
         return cls(message.time_usec * 1e-6, tuple(_tendon(message, i) for i in range(min(message.count, 4))))
 
 
-Report: TypeAlias = Status | Wrench | Tendons
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """ARM_PAYLOAD: what the arm carries, sent while it carries something."""
 
-REPORTS: Final[dict[str, type[Status] | type[Wrench] | type[Tendons]]] = {
-    cls.MESSAGE: cls for cls in (Status, Wrench, Tendons)
-}
+    MESSAGE: ClassVar[str] = "ARM_PAYLOAD"
+
+    time: float  # Unix time, s
+    mass: float  # kg
+    mass_sigma: float  # kg, one sigma
+    centre_of_mass: Vector  # m, body axes
+    centre_of_mass_sigma: Vector  # m
+    valid: bool  # it may be used
+
+    @classmethod
+    def of(cls, message: Message) -> "Payload":
+        """From the message."""
+        return cls(
+            message.time_usec * 1e-6,
+            message.mass,
+            message.mass_sigma,
+            _vector(message.centre_of_mass),
+            _vector(message.centre_of_mass_sigma),
+            bool(message.valid),
+        )
+
+
+Report: TypeAlias = Status | Wrench | Tendons | Payload
+Kind: TypeAlias = type[Status] | type[Wrench] | type[Tendons] | type[Payload]
+
+REPORTS: Final[dict[str, Kind]] = {cls.MESSAGE: cls for cls in (Status, Wrench, Tendons, Payload)}
 
 
 def as_json(report: Report) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text as Line
 
 from arm_companion.ground.arm import Arm
-from arm_companion.ground.reports import Status, Tendons, Wrench
+from arm_companion.ground.reports import Kind, Payload, Status, Tendons, Wrench
 
 STALE_S: Final = 2.0
 _TEXTS: Final = 6
@@ -57,6 +57,8 @@ def summary(arm: Arm) -> str:
         parts.append("tension " + " ".join(_number(t.tension, 1) for t in arm.tendons.tendons) + " N")
     if wrench is not None and "force" in wrench.validity:
         parts.append("force " + " ".join(_number(f, 2) for f in wrench.force) + " N")
+    if arm.payload is not None:
+        parts.append(f"carries {_carried(arm.payload)}")
     if arm.silence > STALE_S:
         parts.append(f"SILENT for {arm.silence:.0f} s")
     return "  ".join(parts)
@@ -83,6 +85,8 @@ def _status(arm: Arm) -> RenderableType:
     table.add_row("tip, mm", "  ".join(_number(1e3 * p, 1) for p in status.tip_position))
     if status.control != (0, 0):
         table.add_row("control", "held by {}/{}".format(*status.control))
+    if (payload := arm.payload) is not None:
+        table.add_row("carries", _carried(payload))
     table.add_row("facts", ", ".join(status.flags) or "-")
     table.add_row("errors", Line(", ".join(status.errors) or "none", style="bold red" if status.errors else "green"))
     return Panel(table, title="state", title_align="left", border_style=_border(arm, Status))
@@ -130,6 +134,11 @@ def _wrench(arm: Arm) -> RenderableType:
     return Panel(table, title=title, title_align="left", border_style=_border(arm, Wrench))
 
 
+def _carried(payload: Payload) -> str:
+    mass = f"{_number(1e3 * payload.mass, 0)} ±{_number(1e3 * payload.mass_sigma, 0)} g"
+    return mass if payload.valid else f"{mass}, not weighed yet"
+
+
 def _texts(arm: Arm) -> RenderableType:
     newest = list(arm.texts)[-_TEXTS:]
     lines = [Line(f"{t.severity}: {t.text}", style=_STYLES.get(t.severity, "bold red")) for t in newest]
@@ -140,7 +149,7 @@ def _rates(rates: Rates) -> RenderableType:
     return Line("  ".join(f"{name} {hertz:.0f}/s" for name, hertz in sorted(rates.hertz.items()) if hertz), style="dim")
 
 
-def _border(arm: Arm, kind: type[Status] | type[Wrench] | type[Tendons]) -> str:
+def _border(arm: Arm, kind: Kind) -> str:
     return "red" if arm.age(kind) > STALE_S else "dim"
 
 

@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 
+from arm_companion.mission import carry
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
@@ -23,7 +24,7 @@ from arm_companion.mission.motion import (
 )
 from arm_companion.mission.sharing import SHARING, SUSPENDED, begin, hung_reference, share_on, unloading
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import PerchKind, Phase, State
+from arm_companion.mission.state import CARRYING, PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
 
 _PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | SUSPENDED
@@ -35,6 +36,7 @@ _REFERENCE_RESTS = frozenset(
         Phase.STOWED,
         Phase.HOLDING,
         Phase.HANG_HOLD,
+        Phase.CARRY,
     }
 )
 _ORDER_OF_PERCH = (
@@ -46,8 +48,12 @@ _ORDER_OF_PERCH = (
     Phase.PERCHED,
 )
 _ORDER_OF_HANG = (*_ORDER_OF_PERCH[:-1], Phase.LOAD_TRANSFER, Phase.HANGING)
+_ORDER_OF_GRASP = (*_ORDER_OF_PERCH[:3], Phase.CLOSE, Phase.VERIFY, Phase.LIFT, Phase.CARRY)
 _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
 _ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
+_ORDER_OF_SETTING_DOWN = (Phase.PLACE, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
+_CURLS = (Phase.WRAP, Phase.CLOSE)
+_WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
@@ -60,15 +66,20 @@ _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; rea
 _BEND_AHEAD_RAD = 0.25  # three times what servos lag by while they curl the arm
 _BEHIND_CURL_M = 0.1  # a wrap in still air is followed within 5 cm
 _LEAN_RATE = 1.0  # m/s^3
+_LOAD_RATE = 4.0  # m/s^3, of a load that comes on or goes off
 _TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that is still to go
 
 
 def prepare(s: Situation) -> State:
     """Memory at the entry of the present phase."""
-    return begin(s) if s.state.phase in SUSPENDED else _prepare(s)
+    if s.state.phase in SUSPENDED:
+        return begin(s)
+    state = _prepare(s)
+    return carry.prepare(s.remembering(state)) if s.grasping else state
 
 
 def _prepare(s: Situation) -> State:
+    """What perch and grasp have in common, and the anchor perch's own."""
     state = s.state
     match state.phase:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
@@ -90,7 +101,7 @@ def _prepare(s: Situation) -> State:
             return dataclasses.replace(state, force=dataclasses.replace(state.force, tared_s=0.0, above_s=0.0))
         case Phase.CONTACT:
             return dataclasses.replace(state, contact_w=_touching(s))
-        case Phase.WRAP:
+        case Phase.WRAP | Phase.CLOSE:
             x, y = s.towards_bar_a
             theta = s.config.perch.wrap_bend_rad
             return dataclasses.replace(state, bend_goal=(theta * x, theta * y))
@@ -115,7 +126,8 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     Returns:
         Memory, what the servos do, and their goals (m of tendon taken in) when they are driven.
     """
-    s = s.remembering(dataclasses.replace(s.state, rest=_rest(s), sharing=share_on(s)))
+    settled = carry.settle(s) if s.grasping else dataclasses.replace(s.state, rest=_rest(s), sharing=share_on(s))
+    s = s.remembering(settled)
     state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
@@ -135,7 +147,7 @@ def _tight_enough(s: Situation) -> bool:
 
     A bar thicker, or a backbone stiffer, than believed: the pull test says whether this grip holds.
     """
-    if s.state.phase is not Phase.WRAP or s.state.bend == s.state.bend_goal:
+    if s.state.phase not in _CURLS or s.state.bend == s.state.bend_goal:
         return False
     return max(s.state.tension, default=0.0) >= _TIGHT_SHARE * s.config.limits.tension_max_n
 
@@ -147,12 +159,12 @@ def _ahead_of_the_others(s: Situation) -> bool:
     arm that lets go waits for its servos alone: the vehicle may be what holds it up.
     """
     reference, phase = s.state.reference, s.state.phase
-    if phase not in (Phase.WRAP, Phase.RELEASE) or reference is None:
+    if phase not in (*_CURLS, Phase.RELEASE) or reference is None:
         return False
     if s.bend_error > _BEND_AHEAD_RAD:
         return True
     behind = norm(sub(reference.position, s.facts.vehicle.position_w))
-    return phase is Phase.WRAP and (behind > _BEHIND_CURL_M or not s.vehicle_fresh)
+    return phase in _CURLS and (behind > _BEHIND_CURL_M or not s.vehicle_fresh)
 
 
 def _pretension(s: Situation, theta: float) -> float:
@@ -176,9 +188,12 @@ def setpoint(s: Situation) -> Setpoint | None:
 
 def progress(s: Situation) -> int:
     """Per cent of the running order, from the phases passed."""
-    hangs = s.state.kind is PerchKind.HANG
-    there, back = (_ORDER_OF_HANG, _ORDER_OF_LEAVING) if hangs else (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
-    for order in (there, back):
+    orders: tuple[tuple[Phase, ...], ...] = (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
+    if s.grasping:
+        orders = (_ORDER_OF_GRASP, _ORDER_OF_SETTING_DOWN, *orders)
+    elif s.state.kind is PerchKind.HANG:
+        orders = (_ORDER_OF_HANG, _ORDER_OF_LEAVING)
+    for order in orders:
         if s.state.phase in order:
             return round(100 * order.index(s.state.phase) / (len(order) - 1))
     return 100 if s.state.phase is Phase.READY else 0
@@ -211,7 +226,7 @@ def _reference(s: Situation) -> Reference | None:
         return hung_reference(s, reference)
     if state.phase is Phase.RELEASE and state.contact_w == ZERO:  # after a restart nobody knows where the bar was met
         return dataclasses.replace(reference, velocity=ZERO)
-    if state.phase in (Phase.WRAP, Phase.RELEASE):
+    if state.phase in (*_CURLS, Phase.RELEASE):
         return Reference(_beside_bar(s), ZERO, state.heading)
     goal, speed = _goal(s)
     return follow(
@@ -263,12 +278,14 @@ def _clear_of_bar(s: Situation) -> Vec3:
 def _goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes in a phase that moves the vehicle, and how fast."""
     perch = s.config.perch
+    if s.grasping and s.state.phase in _WITH_LOAD:
+        return carry.goal(s)
     anchor = s.state.anchor.position_w if s.state.anchor else s.facts.vehicle.position_w
     match s.state.phase:
         case Phase.APPROACH:
             return s.place(perch.standoff_m), perch.approach_speed_m_per_s
         case Phase.DEPART:
-            return s.place(perch.standoff_m), min(perch.approach_speed_m_per_s, s.config.limits.vehicle_speed_m_per_s)
+            return s.standoff, min(perch.approach_speed_m_per_s, s.config.limits.vehicle_speed_m_per_s)
         case Phase.CONTACT:
             return _clear_of_bar(s), perch.reach_speed_m_per_s
         case Phase.REACH:
@@ -303,7 +320,13 @@ def _lean(s: Situation) -> Vec3:
     wanted = ZERO
     if s.state.phase is Phase.PERCHED and s.state.feedforward and prediction is not None:
         wanted = clip_norm(add(prediction.lean, (0.0, 0.0, _trim(s))), s.config.limits.feedforward_m_per_s2)
-    return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), _LEAN_RATE * s.dt))
+    rate = _LEAN_RATE
+    if s.grasping:
+        if s.state.phase is Phase.HOLDING:  # what it held up is gone
+            return ZERO
+        if s.state.phase in _WITH_LOAD and s.state.feedforward:
+            wanted, rate = clip_norm(carry.push(s), s.config.limits.feedforward_m_per_s2), _LOAD_RATE
+    return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), rate * s.dt))
 
 
 def _trim(s: Situation) -> float:

@@ -4,7 +4,7 @@ from arm_companion.mission.machine import mermaid
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.state import Phase
 
-HEADER = """# States of the perches
+HEADER = """# States of perches and grasp
 
 Made from the transition table in `arm_companion/mission/perch.py` and `hang.py`; a test fails when the two differ.
 Aborts are marked ✗. Rows are tried from the table's top, so aborts win over progress.

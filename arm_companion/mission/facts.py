@@ -4,6 +4,7 @@ Frames: w world (NED), b body (FRD), a arm base. Quaternions are (w, x, y, z) an
 """
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
@@ -39,6 +40,7 @@ class VehicleState:
     attitude_age_s: float = float("inf")
     throttle: float = 0.0  # share of full throttle that the motors are asked for together
     throttle_age_s: float = float("inf")
+    thrust: float = math.nan  # share asked of the rotors, 0 to 1 along -z of the body; nan: not told lately
     clock_error_s: float = float("inf")  # greatest error of the ages, by TIMESYNC; inf: they count from the arrival
 
 
@@ -87,6 +89,7 @@ class Order(enum.Enum):
     READY = "ready"
     STOW = "stow"
     PERCH = "perch"
+    GRASP = "grasp"
     RELEASE = "release"
     ABORT = "abort"
     JOG = "jog"

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import hang, hazards, perch
+from arm_companion.mission import grasp, hang, hazards, perch
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -20,9 +20,10 @@ Guard = Callable[[Situation], str | None]
 SITUATIONS: dict[str, tuple[Phase, ...]] = {
     "at rest": (Phase.STARTUP, Phase.STOWED, Phase.READYING, Phase.READY, Phase.STOWING),
     "free flight": (Phase.APPROACH, Phase.REACH, Phase.DEPART),
-    "in contact": (Phase.CONTACT, Phase.WRAP, Phase.RELEASE),
+    "in contact": (Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE),
     "anchored": (Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
     "hanging": (Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK, Phase.HANG_HOLD),
+    "carrying": (Phase.LIFT, Phase.CARRY, Phase.PLACE),
     "holding": (Phase.HOLDING,),
 }
 """Phases by what lies between arm, bar and vehicle. On the ground or in the air, an arm at rest does the same."""
@@ -63,7 +64,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "pilot takes the mode",
         ArmFault.PILOT_TOOK_OVER,
-        (hazards.pilot_takes_over, hang.taken_from_us),
+        (hazards.pilot_takes_over, hang.taken_from_us, grasp.taken_over_while_setting_down),
         "no set-points; goes on with the arm alone",
     ),
     Cause(
@@ -128,7 +129,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "contact lost",
         ArmFault.CONTACT_LOST,
-        (perch.no_grip, perch.pull_test_failed, hazards.grip_lost, hang.slips),
+        (perch.no_grip, grasp.not_closed, perch.pull_test_failed, hazards.grip_lost, hang.slips, grasp.dropped),
         "cannot be told from letting go; a free arm has none",
     ),
     Cause(
@@ -138,10 +139,11 @@ CAUSES: tuple[Cause, ...] = (
         "not judged: the vehicle is not asked to stay, or not held yet",
     ),
     Cause("no contact in time", ArmFault.NO_CONTACT, (perch.no_contact,), "does not apply"),
+    Cause("nothing below to set a load down on", ArmFault.NO_CONTACT, (grasp.nothing_below,), "does not apply"),
     Cause(
         "stiffness test failed",
         ArmFault.GRIP_TEST_FAILED,
-        (perch.pull_test_failed, perch.no_grip),
+        (perch.pull_test_failed, perch.no_grip, grasp.lift_failed, grasp.not_closed),
         "does not apply",
     ),
     Cause(
@@ -237,7 +239,8 @@ def cell(cause: Cause, situation: str) -> str:
 
 _HEADER = """# What happens when things go wrong
 
-Made from the tables in `arm_companion/mission/perch.py`, `hang.py` and `notices.py`; a test fails when the two differ.
+Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.py` and `notices.py`. A test fails when
+the two differ.
 
 - `→` names the state that follows, in the same cycle. Every change is told as STATUSTEXT with its reason, and a
   command that is running is answered with FAILED.
@@ -249,7 +252,8 @@ Made from the tables in `arm_companion/mission/perch.py`, `hang.py` and `notices
 - An arm that may carry a vehicle whose motors idle or stand never opens. What goes wrong with it brings the motors up
   (TAKE_BACK), if the vehicle is ours; if it is not, the arm holds (HANG_HOLD) until a person has the motors carry it.
 - An arm above that is found or left HOLDING goes on to HANG_HOLD at once.
-- Carrying (a grasped object) does not exist in this version, so it has no column.
+- What is carried is never let go by itself: the arm holds, and a person decides. Only a load that is gone already
+  ends the carrying, in HOLDING.
 
 """
 

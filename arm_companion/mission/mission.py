@@ -4,7 +4,7 @@ import dataclasses
 
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
-from arm_companion.mission import actions
+from arm_companion.mission import actions, carry
 from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
 from arm_companion.mission.facts import (
     Answer,
@@ -85,6 +85,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         recover=recover,
         tensions=_tensions(facts, state, prediction),
         stiffness=prediction.stiffness,
+        payload=carry.report(situation),
     )
     return state, commands
 
@@ -105,6 +106,7 @@ def _estimate(s: Situation) -> State:
         force=force,
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
         watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
+        load=carry.track_load(s),
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
         sharing=keep_sharing(s),
     )
@@ -156,7 +158,9 @@ def _settle(state: State, request: Request) -> State:
         case Order.READY:
             return dataclasses.replace(state, streaming=True, errors=ArmFault.NONE)
         case Order.PERCH:
-            return dataclasses.replace(state, errors=ArmFault.NONE, kind=_kind(request))
+            return dataclasses.replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request))
+        case Order.GRASP:
+            return dataclasses.replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR)
         case Order.CLEAR_ERRORS:  # a person has looked at the tendons
             return dataclasses.replace(state, errors=ArmFault.NONE, watch=())
         case Order.FEEDFORWARD:

@@ -3,36 +3,41 @@
 from arm_companion.mission.facts import ArmFault, Severity
 from arm_companion.mission.hang import throttle_lost
 from arm_companion.mission.hazards import (
+    astray,
     disarmed,
     estimator_jumped,
+    failsafe,
     ground_lost,
     hot,
     low_voltage,
     model_blind,
     overrun,
     overstressed,
+    pilot_takes_over,
     servo_fault,
     slack,
     tendon_broken,
     tendon_jumped,
+    vehicle_lost,
+    wrench_over_limit,
 )
 from arm_companion.mission.machine import Warned
 from arm_companion.mission.perch import FREE_FLIGHT, GRASPING, GRIPPED, TENSE
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import MOVES_VEHICLE, Phase
+from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, Phase
 
 Told = Warned[Phase, Situation]
 
 WARNINGS: tuple[Told, ...] = (
     Told(TENSE, servo_fault, Severity.CRITICAL, "the arm holds"),
     *(
-        Told(GRIPPED | {Phase.HOLDING}, guard, Severity.CRITICAL, "the arm holds")
+        Told(GRIPPED | CARRYING | {Phase.HOLDING}, guard, Severity.CRITICAL, "the arm holds")
         for guard in (tendon_broken, tendon_jumped)
     ),
     *(
         Told(
-            frozenset({Phase.PERCHED, Phase.HOLDING}),
+            CARRYING | {Phase.PERCHED, Phase.HOLDING},
             guard,
             Severity.CRITICAL,
             "the arm holds; let go while it still can",
@@ -41,7 +46,7 @@ WARNINGS: tuple[Told, ...] = (
     ),
     *(
         Told(
-            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - {Phase.HOLDING} - SUSPENDED,
+            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - CARRYING - SUSPENDED - {Phase.HOLDING},
             guard,
             Severity.WARNING,
             "no perch is begun",
@@ -71,7 +76,29 @@ WARNINGS: tuple[Told, ...] = (
         "the arm holds on",
         ArmFault.ESTIMATOR_JUMP,
     ),
-    Told(frozenset({Phase.HOLDING}), overstressed, Severity.CRITICAL, "the arm holds"),
+    Told(CARRYING | {Phase.HOLDING}, overstressed, Severity.CRITICAL, "the arm holds"),
+    Told(CARRYING, wrench_over_limit, Severity.CRITICAL, "the arm holds"),
+    *(
+        Told(frozenset({Phase.CARRY}), guard, Severity.WARNING, "the arm holds on, no set-points", error)
+        for guard, error in (
+            (pilot_takes_over, ArmFault.PILOT_TOOK_OVER),
+            (failsafe, ArmFault.AUTOPILOT_FAILSAFE),
+        )
+    ),
+    *(
+        Told(frozenset({Phase.CARRY}), guard, Severity.WARNING, "the arm holds on, the set-point stays", error)
+        for guard, error in (
+            (vehicle_lost, ArmFault.VEHICLE_LOST),
+            (estimator_jumped, ArmFault.ESTIMATOR_JUMP),
+        )
+    ),
+    Told(
+        frozenset({Phase.CARRY}),
+        astray,
+        Severity.WARNING,
+        "the arm holds on, the set-point comes to the vehicle",
+        ArmFault.SETPOINT_REJECTED,
+    ),
     Told(frozenset(Phase), slack, Severity.WARNING),
     Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "nothing is fed forward"),
     Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, ground_lost, Severity.WARNING, "the autopilot decides"),

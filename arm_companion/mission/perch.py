@@ -1,9 +1,11 @@
 """The anchor perch as a table: an arm below wraps a bar and holds, while the vehicle goes on flying.
 
+The rows of the grasp, which shares the way to its object and back, come from `grasp`.
+
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import hang
+from arm_companion.mission import grasp, hang
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -25,17 +27,18 @@ from arm_companion.mission.hazards import (
 )
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, dot, norm, scale, sub
+from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
-from arm_companion.mission.state import FOLLOWS, PerchKind, Phase
+from arm_companion.mission.state import CARRYING, PerchKind, Phase
 
 Row = Transition[Phase, Situation]
 
 FREE_FLIGHT = frozenset({Phase.APPROACH, Phase.REACH})
-GRASPING = frozenset({Phase.CONTACT, Phase.WRAP})
+GRASPING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE})
 GRIPPED = frozenset({Phase.VERIFY, Phase.PERCHED})
 LEAVING = frozenset({Phase.UNLOAD, Phase.RELEASE, Phase.DEPART})
 
-TENSE = GRASPING | GRIPPED | frozenset({Phase.UNLOAD, Phase.HOLDING})
+TENSE = GRASPING | GRIPPED | CARRYING | frozenset({Phase.UNLOAD, Phase.HOLDING})
 """Phases in which the arm may be carrying a load."""
 
 _AT_STANDOFF_M = 0.06
@@ -48,8 +51,6 @@ _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
 _CLEAR_BEND_RAD = 0.25
 _READYING_S = 10.0
-_BAR_WITHIN_M = 50.0
-_BAR_LEVEL = 0.2  # sine of the steepest bar that an upright vehicle can wrap
 
 
 # --- guards: what did not come in time ---
@@ -88,7 +89,7 @@ def no_grip(s: Situation) -> str | None:
 def pull_test_failed(s: Situation) -> str | None:
     """The pull test moved the vehicle as if nothing held it."""
     share = pull_test_share(s)
-    if s.elapsed < _PROBE_S or share < s.config.perch.verify_give_share:
+    if s.grasping or s.elapsed < _PROBE_S or share < s.config.perch.verify_give_share:
         return None
     return f"pull test failed: gave {share:.0%} of the asked move"
 
@@ -134,7 +135,7 @@ def pose_check_failed(s: Situation) -> str | None:
 
 def at_standoff(s: Situation) -> str | None:
     """The vehicle rests at the stand-off, facing the bar."""
-    goal = s.place(s.config.perch.standoff_m)
+    goal = s.standoff
     reference = s.state.reference
     ok = reference is not None and arrived(reference, goal) and at(s, goal, _AT_STANDOFF_M)
     return "at the stand-off" if ok else None
@@ -153,6 +154,11 @@ def contact_settled(s: Situation) -> str | None:
     if reference is None or s.elapsed < _CONTACT_SETTLE_S or reference.velocity != ZERO:
         return None
     return "settled clear of the bar" if at(s, reference.position, _AT_BAR_M) else None
+
+
+def settled_at_object(s: Situation) -> str | None:
+    """The same of an object that is to be grasped."""
+    return contact_settled(s) if s.grasping else None
 
 
 def wrapped(s: Situation) -> bool:
@@ -176,7 +182,7 @@ def pull_test_share(s: Situation) -> float:
 def pull_test_passed(s: Situation) -> str | None:
     """The grip gave less than the allowed share."""
     share = pull_test_share(s)
-    if s.elapsed < _PROBE_S or share >= s.config.perch.verify_give_share:
+    if s.grasping or s.elapsed < _PROBE_S or share >= s.config.perch.verify_give_share:
         return None
     return f"pull test passed: gave {share:.0%} of the asked move"
 
@@ -222,20 +228,9 @@ def cannot_ready(s: Situation) -> str | None:
 
 def cannot_perch(s: Situation) -> str | None:
     """Why a perch cannot begin now."""
-    vehicle = s.facts.vehicle
-    if (lost := vehicle_lost(s)) is not None:
-        return lost
-    if not vehicle.armed or vehicle.landed:
-        return "the vehicle is not flying"
-    if not s.external:
-        return f"the autopilot is in {vehicle.mode or 'an unknown mode'}: switch it to external set-points first"
-    if (distance := norm(sub(s.bar.point_w, vehicle.position_w))) > _BAR_WITHIN_M:
-        return f"the bar is {distance:.0f} m away; at most {_BAR_WITHIN_M:g} m are allowed"
-    if abs(s.bar.axis_w[2]) > _BAR_LEVEL:
-        return "the bar is not level"
-    if s.state.kind is PerchKind.HANG and (reason := hang.cannot_hang(s)) is not None:
+    if (reason := cannot_set_out(s, s.perch_bar, "bar")) is not None:
         return reason
-    return hot(s) or low_voltage(s)
+    return hang.cannot_hang(s) if s.state.kind is PerchKind.HANG else None
 
 
 def cannot_jog_vehicle(s: Situation) -> str | None:
@@ -247,6 +242,7 @@ Ask = OrderRow[Phase, Situation]
 STOWED_ONLY = frozenset({Phase.STOWED})
 
 ORDERS: tuple[Ask, ...] = (
+    *grasp.ORDERS,
     Ask(
         Order.READY,
         frozenset({Phase.STOWED, Phase.STOWING}),
@@ -329,7 +325,7 @@ TABLE: Table[Phase, Situation] = Table(
             "estimator jump",
             ArmFault.ESTIMATOR_JUMP,
         ),
-        Row(FOLLOWS, astray, Phase.STOWING, "set-points not followed", ArmFault.SETPOINT_REJECTED),
+        Row(FREE_FLIGHT | {Phase.DEPART}, astray, Phase.STOWING, "set-points not followed", ArmFault.SETPOINT_REJECTED),
         # then the arm: nothing new is begun with it, and a grip that is tested already stays until a person says
         *(
             Row(phases, guard, target, name, error)
@@ -359,7 +355,9 @@ TABLE: Table[Phase, Situation] = Table(
             "pose check failed",
             ArmFault.TIMEOUT,
         ),
+        *grasp.ABORTS,
         # progress
+        *grasp.PROGRESS,
         *hang.PROGRESS,
         Row(frozenset({Phase.VERIFY}), tested_to_hang, Phase.LOAD_TRANSFER, "pull test passed, to hang"),
         Row(frozenset({Phase.STARTUP}), straight_at_start, Phase.STOWED, "arm at rest"),
@@ -368,6 +366,7 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.APPROACH}), at_standoff, Phase.REACH, "at stand-off"),
         Row(frozenset({Phase.REACH}), contact_found, Phase.CONTACT, "contact found"),
         Row(frozenset({Phase.REACH}), no_contact, Phase.DEPART, "no contact", ArmFault.NO_CONTACT),
+        Row(frozenset({Phase.CONTACT}), settled_at_object, Phase.CLOSE, "settled at the object"),
         Row(frozenset({Phase.CONTACT}), contact_settled, Phase.WRAP, "settled"),
         Row(frozenset({Phase.WRAP}), gripped, Phase.VERIFY, "grip tension"),
         Row(frozenset({Phase.WRAP}), no_grip, Phase.UNLOAD, "no grip", ArmFault.GRIP_TEST_FAILED),
@@ -386,6 +385,7 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.STOWING}), pose_checked, Phase.STOWED, "arm straight"),
         # time limits last: progress in the same cycle wins
         *hang.LIMITS,
+        *grasp.TIME_LIMITS,
         Row(frozenset({Phase.APPROACH}), state_timeout, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
         Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),

@@ -7,9 +7,10 @@ from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Con
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.sharing import SHARING
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Phase, Prediction
+from arm_companion.mission.state import CARRYING, Phase, Prediction
 
 _OVERLOAD = 0x20  # hardware-error bit of a servo
+_TOUCHES = CARRYING | SHARING | {Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD}
 _BEHAVIOUR = {
     Phase.STARTUP: "startup",
     Phase.STOWED: "stowed",
@@ -26,7 +27,7 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
     theta, delta = _polar(prediction.bend)
     goal_theta, goal_delta = _polar(s.state.bend)
     return StatusReport(
-        behaviour=_BEHAVIOUR.get(s.state.phase, "perch"),
+        behaviour=_BEHAVIOUR.get(s.state.phase, s.state.task.value),
         state=s.state.phase.name,
         state_number=s.state.phase.value,
         progress=actions.progress(s) if s.state.running else 255,
@@ -54,9 +55,8 @@ def _flags(s: Situation) -> ArmFlag:
         ArmFlag.SETPOINTS_SENT: actions.setpoint(s) is not None,
         ArmFlag.FEEDFORWARD: state.lean != ZERO
         or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
-        ArmFlag.TARGET_KNOWN: s.facts.bar is not None,
-        ArmFlag.CONTACT: state.phase in (Phase.CONTACT, Phase.WRAP, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD)
-        or state.phase in SHARING,
+        ArmFlag.TARGET_KNOWN: (s.facts.grasp_target if s.grasping else s.facts.bar) is not None,
+        ArmFlag.CONTACT: state.phase in _TOUCHES,
         ArmFlag.ANCHORED: state.phase in (Phase.PERCHED, Phase.HANGING),
     }
     return ArmFlag(sum(flag.value for flag, holds in held.items() if holds))

@@ -12,11 +12,12 @@ from arm_companion.arm.reaction import GRAVITY, mount
 from arm_companion.config.schema import Config
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
-from arm_companion.mission.facts import Bar, Control, Facts, Vec3
-from arm_companion.mission.motion import ZERO, add, dot, norm, scale, sub, turn_by_yaw, unrotate
-from arm_companion.mission.state import MOVES_VEHICLE, State
+from arm_companion.mission.facts import Bar, Control, Facts, Order, Vec3
+from arm_companion.mission.motion import ZERO, add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
+from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
+_ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
 _FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
 
 
@@ -153,16 +154,41 @@ class Situation:
     # --- the bar ---
 
     @property
+    def grasping(self) -> bool:
+        """Whether an object is the target, and not a bar to perch on."""
+        return self.state.task is Order.GRASP
+
+    @property
     def bar(self) -> Bar:
-        """The target: the newest one received, else the configuration's, where the estimator now says it is."""
+        """The target of the present task: the bar, or the object as a bar."""
+        return self.object if self.grasping else self.perch_bar
+
+    @property
+    def perch_bar(self) -> Bar:
+        """The newest bar received, else the configuration's, where the estimator now says it is."""
         bar = self.facts.bar
         if bar is None:
             perch = self.config.perch
-            heading = math.radians(perch.bar_axis_deg)
-            x, y, z = perch.bar_position_m
-            bar = Bar((x, y, z), (math.cos(heading), math.sin(heading), 0.0), perch.bar_radius_m)
+            bar = Bar(_point(perch.bar_position_m), _level(perch.bar_axis_deg), perch.bar_radius_m)
+        return self._after_jumps(bar, self.facts.bar_age_s)
+
+    @property
+    def object(self) -> Bar:
+        """The newest object received, else the configuration's, as a bar: its axis is x of the grasp frame."""
+        target, grasp = self.facts.grasp_target, self.config.grasp
+        axis = _level(grasp.object_axis_deg)
+        if target is None:
+            bar = Bar(_point(grasp.object_position_m), axis, grasp.object_radius_m)
+        else:
+            if target.attitude_wo is not None:
+                axis = rotate(target.attitude_wo, (1.0, 0.0, 0.0))
+            bar = Bar(target.position_w, axis, target.radius, target.covariance_w, target.direction_sigma)
+        return self._after_jumps(bar, self.facts.grasp_target_age_s)
+
+    def _after_jumps(self, bar: Bar, age: float) -> Bar:
+        """A target told `age` seconds ago, moved with what the estimator has jumped since."""
         vigil = self.state.vigil
-        if vigil.shift == ZERO or self.t - self.facts.bar_age_s > vigil.jumped_at:  # nothing jumped since it was told
+        if vigil.shift == ZERO or self.t - age > vigil.jumped_at:  # nothing jumped since it was told
             return bar
         return dataclasses.replace(bar, point_w=add(bar.point_w, vigil.shift))
 
@@ -182,6 +208,23 @@ class Situation:
         base = sub(bar.point_w, scale(self.ahead, back))
         base = sub(base, scale(self.straight_w, perch.contact_arc_m))
         return sub(base, self.base_offset_w(self.state.heading))
+
+    @property
+    def standoff(self) -> Vec3:
+        """Vehicle position at the stand-off: before the target, or before the place where an object was let go."""
+        distance = self.config.perch.standoff_m
+        if self.grasping and self.state.phase is Phase.DEPART:
+            return sub(self.state.contact_w, scale(self.ahead, distance))
+        return self.place(distance)
+
+    @property
+    def setting_down(self) -> Vec3:
+        """Vehicle position as low as it may go to set an object down: where it was taken, or below where it hovers."""
+        place, here = self.probe, self.facts.vehicle.position_w
+        reference = self.state.reference
+        away = norm((place[0] - here[0], place[1] - here[1], 0.0)) > _ELSEWHERE_M
+        x, y, _ = (reference.position if reference is not None else here) if away else place
+        return x, y, place[2] + (0.0 if math.isnan(self.state.load.now) else self.config.grasp.place_search_m)
 
     @property
     def straight_w(self) -> Vec3:
@@ -230,6 +273,16 @@ class Situation:
     def slipped(self) -> float:
         """How far the anchored vehicle is from where it was asked to be, m."""
         return norm(sub(self.moved, self.state.offset))
+
+
+def _point(position: tuple[float, ...]) -> Vec3:
+    x, y, z = position
+    return x, y, z
+
+
+def _level(heading_deg: float) -> Vec3:
+    heading = math.radians(heading_deg)
+    return (math.cos(heading), math.sin(heading), 0.0)
 
 
 def _column(matrix: Array, j: int) -> Vec3:

@@ -7,12 +7,13 @@ from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
 from arm_companion.mission.motion import ZERO, Reference
+from arm_companion.mission.payload import NO_LOAD, Load
 from arm_companion.mission.tendon_watch import Expected, TendonWatch
 from arm_companion.record_codec import UNRECORDED
 
 
 class Phase(enum.Enum):
-    """States of the perches, in the order of a flight; the value is the number of ARM_STATE."""
+    """States of perches and grasp, each in the order of a flight; the value is the number of ARM_STATE."""
 
     STARTUP = 0
     STOWED = 1
@@ -30,17 +31,25 @@ class Phase(enum.Enum):
     STOWING = 13
     HOLDING = 14
     LOAD_TRANSFER = 15
+    CLOSE = 16
+    LIFT = 17
+    CARRY = 18
+    PLACE = 19
     HANGING = 22
     TAKE_BACK = 23
     HANG_HOLD = 24
 
 
-MOVES_VEHICLE = frozenset(
+CARRYING = frozenset({Phase.LIFT, Phase.CARRY, Phase.PLACE})
+"""Phases in which the vehicle alone holds up what the arm holds."""
+
+MOVES_VEHICLE = CARRYING | frozenset(
     {
         Phase.APPROACH,
         Phase.REACH,
         Phase.CONTACT,
         Phase.WRAP,
+        Phase.CLOSE,
         Phase.VERIFY,
         Phase.PERCHED,
         Phase.UNLOAD,
@@ -101,7 +110,7 @@ class Prediction:
     stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
-FOLLOWS = frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
+FOLLOWS = CARRYING | frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
 """Phases in which nothing but air is between the vehicle and its reference."""
 
 
@@ -174,6 +183,7 @@ class State:
     since: float = 0.0  # loop time of entry
     t: float = 0.0  # loop time of the previous step
     running: Running | None = None
+    task: Order = Order.PERCH  # what the arm reaches out for: PERCH or GRASP
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
     armed: bool = False  # of the previous step, to see the motors stop
     streaming: bool = False  # set-points go out
@@ -188,6 +198,7 @@ class State:
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last
     watch: tuple[TendonWatch, ...] = ()  # of each tendon
     vigil: Vigil = Vigil()
+    load: Load = NO_LOAD  # what the rotors lift beyond the vehicle
     feedforward: bool = True  # switched on
     position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None

@@ -14,16 +14,17 @@ from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
+from arm_companion.mission import carry
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.hung_wrench import hung_wrench
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import Anchor, Phase, Prediction
+from arm_companion.mission.state import CARRYING, Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
-_TOUCHING = frozenset({Phase.CONTACT, Phase.WRAP, Phase.RELEASE, Phase.HOLDING}) | SUSPENDED
+_TOUCHING = CARRYING | SUSPENDED | frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE, Phase.HOLDING})
 _FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - {Phase.STARTUP, Phase.REACH}
 _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
@@ -49,7 +50,7 @@ def predict(s: Situation) -> Prediction:
     free = held = None
     with suppress(ModelError):
         free = _free(s, None if last is None else last.free)
-    holding = s.state.phase in _ANCHORED and s.state.anchor is not None
+    holding = s.state.phase in _ANCHORED and s.state.anchor is not None and not s.grasping
     if holding:
         with suppress(ModelError):
             held = anchored(s, s.state.position, None if last is None else last.anchored)
@@ -69,12 +70,13 @@ def predict(s: Situation) -> Prediction:
 
 
 def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:
-    """The arm as it would hang with nothing at its tip.
+    """The arm as it hangs with nothing at its tip but what it carries.
 
     Raises:
         ModelError: no equilibrium was found.
     """
-    return s.parameters.model.free(np.asarray(s.pulls), np.asarray(s.gravity_a), start=start)
+    pulls, gravity = np.asarray(s.pulls), np.asarray(s.gravity_a)
+    return s.parameters.model.free(pulls, gravity, payload=carry.payload(s), start=start)
 
 
 def _tensions(s: Situation, free: ArmSolution | None) -> tuple[Expected, ...]:
@@ -159,7 +161,9 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     if holding:
         source = WrenchSource.ANCHORED
     else:
-        source = WrenchSource.CONTACT if s.state.phase in _TOUCHING else WrenchSource.FREE
+        source = WrenchSource.CONTACT if _touches(s) else WrenchSource.FREE
+        if carry.payload(s) is not None:
+            source = WrenchSource.PAYLOAD
     if solution is None or not s.vehicle_fresh:
         return _nothing(source)
     vehicle = s.facts.vehicle
@@ -169,7 +173,7 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
             s.mount,
             np.asarray(s.gravity_a),
             BodyMotion(rate=np.asarray(vehicle.rate_b)),
-            spread=_SPREAD,
+            spread=_spread(s, solution),
             age=max(vehicle.position_age_s, vehicle.attitude_age_s),
         )
     except ModelError:
@@ -179,6 +183,19 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     # how the bar pushes on an arm that touches but does not hold is not known
     report = _report(found, source, valid=source is not WrenchSource.CONTACT)
     return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
+
+
+def _touches(s: Situation) -> bool:
+    """Whether something unknown may be pushing on the arm."""
+    return s.state.phase in _TOUCHING or (s.grasping and s.state.phase in _ANCHORED)
+
+
+def _spread(s: Situation, solution: ArmSolution) -> Spread:
+    """What the prediction rests on; of a load, its weight."""
+    if carry.payload(s) is None:
+        return _SPREAD
+    sigma = s.state.load.sigma(s.config.vehicle.mass_kg) / max(solution.moments.mass, 1e-6)
+    return replace(_SPREAD, mass=math.hypot(_SPREAD.mass, sigma))
 
 
 def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:

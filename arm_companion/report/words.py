@@ -13,7 +13,8 @@ _HOT_DEGC: Final = 65.0
 _NEAR: Final = 0.9
 _AT_REST: Final = frozenset({"STARTUP", "STOWED", "READY"})
 _TOUCHING: Final = frozenset(
-    {"CONTACT", "WRAP", "VERIFY", "PERCHED", "UNLOAD", "RELEASE", "LOAD_TRANSFER", "HANGING", "TAKE_BACK"}
+    {"CONTACT", "WRAP", "CLOSE", "VERIFY", "PERCHED", "LIFT", "CARRY", "PLACE", "UNLOAD", "RELEASE"}
+    | {"LOAD_TRANSFER", "HANGING", "TAKE_BACK"}
 )
 
 
@@ -49,19 +50,19 @@ def judge(flight: RecordedFlight) -> Verdict:
 
 
 def _headline(flight: RecordedFlight) -> str:
-    for name, word in (("HANGING", "Hung"), ("PERCHED", "Perched")):
+    for name, did in (("HANGING", "Hung"), ("PERCHED", "Perched"), ("CARRY", "Carried an object")):
         held = [span.end - span.begin for span in flight.spans if span.name == name]
-        if not held:
-            continue
-        after = [span.name for span in flight.spans[_last(flight, name) + 1 :]]
-        let_go = "and let go" if "DEPART" in after else "and did not let go in this record"
-        times = "once" if len(held) == 1 else f"{len(held)} times"
-        return f"{word} {times}, {sum(held):.0f} s in all, {let_go}."
+        if held:
+            after = [span.name for span in flight.spans[_last(flight, name) + 1 :]]
+            let_go = "and let go" if "DEPART" in after else "and did not let go in this record"
+            times = "once" if len(held) == 1 else f"{len(held)} times"
+            return f"{did} {times}, {sum(held):.0f} s in all, {let_go}."
     tried = [span for span in flight.spans if span.name == "APPROACH"]
     if not tried:
-        return "No perch was ordered."
+        return "No perch or grasp was ordered."
     last = next((span for span in reversed(flight.spans) if span.name in {"UNLOAD", "DEPART", "HOLDING"}), None)
-    return f"Did not perch: {last.cause}." if last else "Did not perch."
+    did = "grasp" if any(span.name == "CLOSE" for span in flight.spans) else "perch"
+    return f"Did not {did}: {last.cause}." if last else f"Did not {did}."
 
 
 def _last(flight: RecordedFlight, name: str) -> int:

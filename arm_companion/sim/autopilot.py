@@ -26,7 +26,7 @@ from arm_companion.sim.autopilot_telemetry import Battery, Telemetry
 from arm_companion.sim.estimator import Estimator
 from arm_companion.sim.flight_control import Airframe, Estimate, FlightController
 from arm_companion.sim.mavlink_router import SYSTEM, Port, Router, RouterCounters
-from arm_companion.sim.ports import RigidState, RotorCommand
+from arm_companion.sim.ports import RigidState, RotorCommand, Vec3
 from arm_companion.transport.base import Opener
 
 _HOVER_THRUST_ERROR = 0.05
@@ -59,7 +59,8 @@ class AutopilotStandIn:
         mass = config.vehicle.mass_kg
         north, east, down = (mass * radius**2 for radius in _GYRATION_M)
         scale = 1.0 + self._rng.uniform(-_HOVER_THRUST_ERROR, _HOVER_THRUST_ERROR)
-        self._controller = FlightController(Airframe(mass, (north, east, down), scale))
+        frame = Airframe(mass, (north, east, down), scale, thrust_curve=config.sim.thrust_curve)
+        self._controller = FlightController(frame)
         self._estimator = Estimator(self._rng, config.sim.position_noise_m)
         self._battery = Battery()
         defaults = dict(self._flavour.parameters)
@@ -107,6 +108,7 @@ class AutopilotStandIn:
             rotors = self._controller.update(estimate, demand.setpoint, dt, demand.release)
         self._modes.thrust_share = self._controller.thrust
         self._battery.draw(self._controller.thrust, dt)
+        self._controller.supply = self._battery.thrust_share
         return rotors
 
     def take_over(self, mode: str) -> None:
@@ -168,6 +170,15 @@ class AutopilotStandIn:
     def estimate(self) -> Estimate:
         """The estimator's present idea of the motion."""
         return self._modes.estimate
+
+    @property
+    def asked_w(self) -> Vec3 | None:
+        """Position that is flown to, m; None where none is, or not in all axes."""
+        flown = self._modes.flown
+        if flown is None:
+            return None
+        x, y, z = flown.position_w
+        return None if x is None or y is None or z is None else (x, y, z)
 
     @property
     def counters(self) -> RouterCounters:

@@ -45,6 +45,7 @@ class Flavour:
         modes: custom_mode of each mode; of two modes with one number the first is meant when it is asked for.
         names: the stack's own name of each mode, for `take_over`.
         boot_mode: mode after power-up.
+        hover_thrust: share of full thrust at which the vehicle is believed to hover.
         ready_s: s from boot to a ready estimator and arming.
         refused: MAV_RESULT of a refused arming or mode.
         mode_acks_first: DO_SET_MODE is acknowledged as accepted before it is tried, and then again.
@@ -68,6 +69,7 @@ class Flavour:
     modes: Mapping[Mode, int]
     names: Mapping[str, Mode]
     boot_mode: Mode
+    hover_thrust: float
     ready_s: float
     refused: int
     mode_acks_first: bool
@@ -109,6 +111,7 @@ PX4 = Flavour(
     modes=_PX4_MODES,
     names={mode.value: mode for mode in Mode} | {"HOLD": Mode.HOLD},
     boot_mode=Mode.HOLD,
+    hover_thrust=0.5,  # MPC_THR_HOVER
     ready_s=8.0,
     refused=mav.MAV_RESULT_TEMPORARILY_REJECTED,
     mode_acks_first=True,
@@ -138,6 +141,7 @@ PX4 = Flavour(
         mav.MAVLINK_MSG_ID_HEARTBEAT: 1.0,
         mav.MAVLINK_MSG_ID_ATTITUDE: 50.0,
         mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
+        mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: 50.0,
         mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 30.0,
         mav.MAVLINK_MSG_ID_ODOMETRY: 30.0,
         mav.MAVLINK_MSG_ID_HIGHRES_IMU: 50.0,
@@ -192,6 +196,7 @@ ARDUPILOT = Flavour(
         "BRAKE": Mode.HOLD,
     },
     boot_mode=Mode.MANUAL,
+    hover_thrust=0.35,  # MOT_THST_HOVER, its default
     ready_s=42.0,
     refused=mav.MAV_RESULT_FAILED,
     mode_acks_first=False,

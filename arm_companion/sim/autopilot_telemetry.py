@@ -14,6 +14,8 @@ HOME_LATITUDE_DEG, HOME_LONGITUDE_DEG, HOME_ALTITUDE_M = 47.397742, 8.545594, 48
 _M_PER_DEG = 111_319.49
 _UNKNOWN_U16 = 65535
 _CELLS = 4
+_FULL_V = _CELLS * 4.18 - 0.02 * 14.5
+_THRUST_OF_VOLTAGE = 1.6
 
 
 @dataclass(slots=True)
@@ -39,6 +41,11 @@ class Battery:
         """V at the terminals."""
         return _CELLS * (3.5 + 0.68 * self.remaining) - 0.02 * self.current_a
 
+    @property
+    def thrust_share(self) -> float:
+        """Thrust of rotors on this voltage over that on a full battery at hover: rotor speed follows V^0.8."""
+        return math.pow(self.voltage / _FULL_V, _THRUST_OF_VOLTAGE)
+
 
 Builder = Callable[[], Any]
 """Makes a message of the present state, or None while that is not known."""
@@ -62,6 +69,7 @@ class Telemetry:
             mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_sys_state,
             mav.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             mav.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
+            mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: self._attitude_target,
             mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position_ned,
             mav.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position_int,
             mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED: self._position_target,
@@ -156,6 +164,16 @@ class Telemetry:
     def _attitude_quaternion(self) -> Any:
         e = self._estimate
         return mav.MAVLink_attitude_quaternion_message(self._boot_ms, *e.attitude_wb, *e.rate_b)
+
+    def _attitude_target(self) -> Any:
+        """The thrust asked for; attitude and rates are masked, since nobody needs them."""
+        mask = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE | (
+            mav.ATTITUDE_TARGET_TYPEMASK_BODY_ROLL_RATE_IGNORE
+            | mav.ATTITUDE_TARGET_TYPEMASK_BODY_PITCH_RATE_IGNORE
+            | mav.ATTITUDE_TARGET_TYPEMASK_BODY_YAW_RATE_IGNORE
+        )
+        thrust = min(self._flavour.hover_thrust * self._modes.thrust_share, 1.0)
+        return mav.MAVLink_attitude_target_message(self._boot_ms, mask, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, thrust)
 
     def _local_position_ned(self) -> Any | None:
         if not self._modes.ready:

@@ -28,7 +28,10 @@ def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
             _shade(axis, flight, start)
         _name_states(axes[0], flight, start)
         _draw_position(axes[0], flight, config, start)
-        _draw_moves(axes[1], flight, start)
+        if config.sim.object.mass_kg:
+            _draw_load(axes[1], flight, config, start)
+        else:
+            _draw_moves(axes[1], flight, start)
         _draw_tendons(axes[2], flight, config, start)
         _draw_force(axes[3], flight, start)
         _draw_contact(axes[4], flight, start)
@@ -60,13 +63,13 @@ def _name_states(axis: Axes, flight: Flight, start: float) -> None:
 
 def _draw_position(axis: Axes, flight: Flight, config: Config, start: float) -> None:
     t = [s.t - start for s in flight.samples]
-    x, _, z = config.sim.bar.position_m
+    x, _, z = config.sim.object.position_m if config.sim.object.mass_kg else config.sim.bar.position_m
     for i, (name, colour) in enumerate((("north", _X), ("east", _Y), ("up", _Z))):
         sign = -1.0 if name == "up" else 1.0
         axis.plot(t, [sign * s.state.position_w[i] for s in flight.samples], color=colour, lw=1.2, label=name)
     axis.axhline(x, color=_X, lw=0.8, ls=":")
     axis.axhline(-z, color=_Z, lw=0.8, ls=":")
-    axis.set_ylabel("vehicle, m\n(dotted: bar)")
+    axis.set_ylabel("vehicle, m\n(dotted: bar or object)")
     axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
 
 
@@ -91,6 +94,28 @@ def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
             if asked:
                 axis.plot([mark.start - start, mark.end - start], [1e3 * asked] * 2, color=colour, lw=3, alpha=0.35)
     axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_load(axis: Axes, flight: Flight, config: Config, start: float) -> None:
+    """Height of the object, and what it is said to weigh."""
+    seen = [(s.t - start, s.truth.object_position_w) for s in flight.samples if s.truth.object_position_w is not None]
+    if seen:
+        axis.plot([t for t, _ in seen], [1e3 * (seen[0][1][2] - p[2]) for _, p in seen], color=_INK, lw=1.0)
+    axis.set_ylabel("object over its\ncradles, mm")
+    right = axis.twinx()
+    right.axhline(1e3 * config.sim.object.mass_kg, color=_X, lw=0.8, ls=":")
+    valid = [p for p in flight.payloads if p.valid]
+    right.errorbar(
+        [p.t - start for p in valid],
+        [1e3 * p.mass for p in valid],
+        [1e3 * p.sigma for p in valid],
+        fmt=".",
+        color=_X,
+        ms=3.0,
+        lw=0.6,
+    )
+    right.set_ylabel("weighed, g\n(dotted: true)", color=_X)
+    right.spines["right"].set_visible(True)
 
 
 def _draw_tendons(axis: Axes, flight: Flight, config: Config, start: float) -> None:

@@ -7,6 +7,9 @@ from arm_companion.sim.world import Sample
 
 Vec3 = tuple[float, float, float]
 
+WITH, WITHOUT, CARRIED = "grasp", "grasp, not compensated", "carried"
+"""Names of the marks of a grasp."""
+
 
 @dataclass(frozen=True, slots=True)
 class WrenchSeen:
@@ -29,6 +32,16 @@ class TendonsSeen:
 
 
 @dataclass(frozen=True, slots=True)
+class PayloadSeen:
+    """One ARM_PAYLOAD as the operator received it."""
+
+    t: float
+    mass: float
+    sigma: float
+    valid: bool
+
+
+@dataclass(frozen=True, slots=True)
 class Mark:
     """A span of time in which the operator asked for something to be measured."""
 
@@ -46,6 +59,7 @@ class Flight:
     states: list[tuple[float, str]] = field(default_factory=list)  # entry time and name
     wrenches: list[WrenchSeen] = field(default_factory=list)
     tendons: list[TendonsSeen] = field(default_factory=list)
+    payloads: list[PayloadSeen] = field(default_factory=list)
     texts: list[tuple[float, str]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
     end: float = 0.0

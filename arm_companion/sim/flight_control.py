@@ -59,6 +59,8 @@ class Airframe:
         torque_max: N m, about each body axis.
         arm: m, from the centre to a rotor along a body axis: what thrust there is, it can turn the vehicle with.
         motor_lag: s, time constant of the rotors.
+        thrust_curve: how far the rotors' thrust is from linear in what is commanded, at hover's own scale: of the
+            share x of hover thrust they deliver (1 - c) x + c x^2 (PX4's THR_MDL_FAC, where it is left uncorrected).
     """
 
     mass: float
@@ -69,6 +71,7 @@ class Airframe:
     torque_max: Vec3 = (1.8, 1.8, 0.35)
     arm: float = 0.18
     motor_lag: float = 0.025
+    thrust_curve: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +144,8 @@ class FlightController:
         self._rotors = [0.0, 0.0, 0.0, 0.0]  # delivered thrust (N) and torques (N m)
         self.thrust = 0.0
         """Last commanded thrust as a share of believed hover thrust."""
+        self.supply = 1.0
+        """Share of its nominal thrust that the supply leaves to the rotors."""
 
     @property
     def velocity_integral(self) -> Vec3:
@@ -311,9 +316,11 @@ class FlightController:
 
     def _spin(self, thrust: float, torque: Vec3, dt: float) -> RotorCommand:
         """First-order lag of the rotors towards what is commanded."""
-        rotors, scale = self._rotors, self.airframe.thrust_scale
+        rotors, scale, c = self._rotors, self.airframe.thrust_scale, self.airframe.thrust_curve
         share = 1.0 - math.exp(-dt / self.airframe.motor_lag)
-        rotors[0] += share * (scale * thrust - rotors[0])
+        hover = self.airframe.mass * GRAVITY
+        delivered = scale * self.supply * thrust * (1.0 - c + c * thrust / hover)
+        rotors[0] += share * (delivered - rotors[0])
         rotors[1] += share * (scale * torque[0] - rotors[1])
         rotors[2] += share * (scale * torque[1] - rotors[2])
         rotors[3] += share * (scale * torque[2] - rotors[3])

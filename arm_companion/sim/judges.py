@@ -6,6 +6,7 @@ from typing import Any
 
 from arm_companion.config.schema import Config
 from arm_companion.sim.flight import Flight
+from arm_companion.sim.grasp_verdict import judge_grasp
 from arm_companion.sim.hang_verdict import judge_hang
 from arm_companion.sim.mjcf import GRAVITY
 from arm_companion.sim.scenario import Operator
@@ -21,12 +22,14 @@ class Scenario:
         done: what a success is called.
         fly: what the operator does; gives why it failed, or an empty string.
         judge: the verdict on a flight, with the script's failure and the world as it was.
+        fly_trial: what the operator does in a trial, where that is shorter.
     """
 
     title: str
     done: str
     fly: Callable[[Operator], Coroutine[Any, Any, str]]
     judge: Callable[[Flight, str, Config], Verdict]
+    fly_trial: Callable[[Operator], Coroutine[Any, Any, str]] | None = None
 
 
 SCENARIOS: Mapping[str, Scenario] = {
@@ -42,4 +45,5 @@ SCENARIOS: Mapping[str, Scenario] = {
         Operator.fly_hang,
         lambda flight, failure, world: judge_hang(flight, failure, GRAVITY * world.vehicle.mass_kg),
     ),
+    "grasp": Scenario("Grasp", "grasped and put back", Operator.fly_grasp, judge_grasp, Operator.fly_grasp_once),
 }

@@ -26,6 +26,8 @@ AIRFRAME = "airframe"
 FLIGHT = "flight"
 ARM_BASE = "arm base"
 BAR = "bar"
+OBJECT = "object"
+CRADLES = "cradles"
 TIP = "tip"
 BENDING, TORSION = "bending", "torsion"  # first word of a hinge's name
 
@@ -50,9 +52,12 @@ _LEAST_LEG = 0.2
 _GROUND_MARGIN = 0.05
 _BAR_HALF_LENGTH = 0.75
 _DISK_HALF_THICKNESS = 0.002
+_CRADLE_SHARE = 0.35  # of the object's length, from its middle to each cradle
+_PLANK = (0.012, 0.03, 0.004)  # half sizes of a cradle's two planks, m
 
 # Collision classes. The arm does not meet itself, and its first links, which the mount shields, not the airframe.
 _GROUND, _BAR, _ARM, _AIRFRAME, _FEET = 1, 2, 4, 8, 16
+ARM_GROUP = _ARM
 _SHIELDED_LINKS = 3
 
 
@@ -132,6 +137,7 @@ def model_xml(config: Config) -> str:
 {_arm(config)}
       </body>
     </body>
+{_object(config, stand)}
   </worldbody>
   <tendon>
 {_tendons(config.arm)}
@@ -167,6 +173,41 @@ def rotor(i: int) -> str:
 def up(vector: Sequence[float]) -> tuple[float, float, float]:
     """World vector from NED to MuJoCo's z-up axes, or back."""
     return (vector[0] * NED_TO_UP[0], vector[1] * NED_TO_UP[1], vector[2] * NED_TO_UP[2])
+
+
+def _object(config: Config, stand: float) -> str:
+    """A cylinder that lies across two cradles on posts; an object of no mass does not exist."""
+    thing = config.sim.object
+    if not thing.mass_kg:
+        return ""
+    x, y, z = up(thing.position_m)
+    post = max(z + stand - thing.radius_m * math.sqrt(2.0), 2.0 * _PLANK[2])  # length, from the ground up
+    tangent = thing.radius_m + _PLANK[2]
+    solid = f'contype="{_GROUND}" conaffinity="{_ARM | _AIRFRAME}" rgba=".6 .6 .55 1"'
+    lines = [f'<body name="{CRADLES}" pos="{x} {y} {z}" euler="0 0 {-thing.axis_deg}">']
+    for side in (-_CRADLE_SHARE * thing.length_m, _CRADLE_SHARE * thing.length_m):
+        top = -thing.radius_m * math.sqrt(2.0)
+        lines.append(
+            f'<geom type="capsule" size="0.008" fromto="{side} 0 {top - post} {side} 0 {top - 0.016}" {solid}/>'
+        )
+        for slope in (45.0, -45.0):  # its upper face touches the cylinder
+            a = math.radians(slope)
+            place = f"{side} {-tangent * math.sin(a)} {-tangent * math.cos(a)}"
+            lines.append(f'<geom type="box" size="{_join(_PLANK)}" pos="{place}" euler="{-slope} 0 0" {solid}/>')
+    half = 0.5 * thing.length_m - thing.radius_m
+    friction = f"{thing.friction} 0.005 0.0001"
+    lines += [
+        "</body>",
+        f'<body name="{OBJECT}" pos="{x} {y} {z}" euler="0 0 {-thing.axis_deg}">',
+        f'<freejoint name="{OBJECT}"/>',
+        (
+            f'<geom name="{OBJECT}" class="bar" type="capsule" size="{thing.radius_m}" mass="{thing.mass_kg}" '
+            f'fromto="{-half} 0 0 {half} 0 0" conaffinity="{_ARM | _AIRFRAME | _GROUND}" friction="{friction}" '
+            'rgba=".2 .4 .6 1"/>'
+        ),
+        "</body>",
+    ]
+    return _indent(lines, 4)
 
 
 def _airframe(config: Config, stand: float) -> str:

@@ -52,7 +52,10 @@ class Plant:
         self._dt = float(model.opt.timestep)
         self._airframe = model.body(mjcf.AIRFRAME).id
         self._base = model.body(mjcf.ARM_BASE).id
-        self._bar = model.body(mjcf.BAR).id
+        self._object = model.body(mjcf.OBJECT).id if config.sim.object.mass_kg else -1
+        # what the arm holds in this world: the object, where there is one, else the bar
+        self._bar = model.body(mjcf.BAR).id if self._object < 0 else self._object
+        self._ground = {0} if self._object < 0 else {0, model.body(mjcf.CRADLES).id}
         self._tip = model.site(mjcf.TIP).id
         self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
         self._rotors = np.array([model.geom(mjcf.rotor(i)).id for i in range(4)])
@@ -170,6 +173,13 @@ class Plant:
         """Let tendon `i` jump: from now on it is `longer` m longer (negative: shorter) for the same pull."""
         self._longer[i] += longer
 
+    def lose_object(self) -> None:
+        """Let the object slip out of the arm: from now on the two do not meet."""
+        geom = self._model.geom(mjcf.OBJECT)
+        geom.conaffinity[0] &= ~mjcf.ARM_GROUP
+        for i in np.flatnonzero(self._link_of_geom >= 0):
+            self._model.geom_conaffinity[i] &= ~int(geom.contype[0])
+
     def _set_pulls(self, pulls: Sequence[float]) -> None:
         """Set the tendon springs' rest lengths, beyond which a tendon pulls; a slack tendon does not damp either.
 
@@ -188,7 +198,9 @@ class Plant:
         force, torque = self._interface_wrench()
         contact, net, wrap = self._bar_contact()
         bodies = model.geom_bodyid[data.contact.geom]
-        outside = np.any((bodies == 0) | (bodies == self._bar), axis=1)  # ground or bar
+        ground = np.isin(bodies, list(self._ground))
+        outside = np.any(ground | (bodies == self._bar), axis=1)
+        thing = np.any(bodies == self._object, axis=1)
         tension = self.tensions()
         mujoco.mj_kinematics(model, data)  # the tip where it is after the step, as in `state`
         return PlantTruth(
@@ -201,6 +213,8 @@ class Plant:
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
             body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
             rotor_contact=bool(np.any(np.isin(data.contact.geom, self._rotors))),
+            object_position_w=None if self._object < 0 else mjcf.up(data.xpos[self._object].tolist()),
+            object_supported=bool(np.any(thing & np.any(ground, axis=1))),
         )
 
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:

@@ -34,10 +34,12 @@ class PlantTruth:
 
     force_b: Vec3  # N, of the arm on the airframe, body axes
     torque_b: Vec3  # N m, of the arm on the airframe about the airframe's centre of mass, body axes
-    contact_force_n: float  # sum of the normal forces between arm and bar
-    contact_net_w: Vec3  # N, net force of the bar on the arm, world axes
+    contact_force_n: float  # sum of the normal forces between arm and bar or object
+    contact_net_w: Vec3  # N, net force of bar or object on the arm, world axes
     wrap_angle: float  # rad of the bar's circumference that the arm's contacts span, seen along its axis
     tension: tuple[float, ...]  # N, true tendon tensions
     tip_position_w: Vec3  # m
-    body_contact: bool  # the airframe itself touches bar or ground
+    body_contact: bool  # the airframe itself touches bar, object, cradles or ground
     rotor_contact: bool = False  # something, the arm too, reaches into a propeller's disk
+    object_position_w: Vec3 | None = None  # m, middle of the object; None: there is none
+    object_supported: bool = False  # it touches cradles or ground

@@ -8,6 +8,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.table import Table
 
+from arm_companion.sim.grasp_verdict import GraspVerdict
 from arm_companion.sim.trials import Outcome, Summary
 from arm_companion.sim.verdict import Verdict
 
@@ -39,8 +40,8 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
         table.add_row(f"in {name}", f"{seconds:.1f} s", "")
     table.add_section()
     mean, most = verdict.contact_force_n
-    table.add_row("contact force while perched", f"{mean:.1f} N", f"greatest {most:.1f} N")
-    table.add_row("arm around the bar", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while perched")
+    table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
+    table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
     for wrench in verdict.wrench:
         table.add_row(
             f"wrench on airframe, {wrench.span}",
@@ -58,6 +59,8 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
             f"{_mm(move.made_m)} made",
             f"asked {_mm(move.asked_m)}, error {_mm(move.error_m)}, arm's force {move.force_n:.1f} N",
         )
+    if isinstance(verdict, GraspVerdict):
+        _show_grasp(verdict, table)
     console.print(table)
     style = "bold green" if verdict.success else "bold red"
     console.print(
@@ -68,6 +71,25 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
     for path in files:
         if path.exists():
             console.print(f"  {path}", soft_wrap=True)
+
+
+def _show_grasp(verdict: GraspVerdict, table: Table) -> None:
+    """What a grasp has besides."""
+    for pick_up in verdict.pick_ups:
+        table.add_row(
+            f"pick-up: {pick_up.name}",
+            f"{_mm(pick_up.error_m)} RMS",
+            f"from the height asked, at most {_mm(pick_up.worst_m)} too low; {_mm(pick_up.aside_m)} RMS aside; "
+            f"{pick_up.seconds:.1f} s",
+        )
+    if not math.isnan(verdict.weighed_kg):
+        table.add_row(
+            "object weighed",
+            f"{1e3 * verdict.weighed_kg:.0f} g",
+            f"one sigma {1e3 * verdict.weighed_sigma_kg:.0f} g; true {1e3 * verdict.mass_kg:.0f} g, "
+            f"error {verdict.mass_error:+.1%}",
+        )
+    table.add_row("object put down", _mm(verdict.placed_m), "from where it lay")
 
 
 def show_outcome(outcome: Outcome, done: str, stream: TextIO) -> None:

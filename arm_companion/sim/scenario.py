@@ -9,7 +9,7 @@ from typing import Any
 
 from arm_companion.config.schema import Config
 from arm_companion.protocol.dialect import mav
-from arm_companion.sim.flight import Flight, Mark, TendonsSeen, Vec3, WrenchSeen
+from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight, Mark, PayloadSeen, TendonsSeen, Vec3, WrenchSeen
 from arm_companion.sim.operator_link import Address, OperatorLink
 
 Say = Callable[[str], None]
@@ -21,6 +21,7 @@ _HANG_S = 15.0
 _STANDS_S = 8.0
 _STREAM_S = 3.0  # a heartbeat tells of the arming within a second, and PX4 wants a second of stream
 _FORCE = 21196.0  # param2 of a disarming that asks for no landing
+_CARRY_S = 4.0
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -65,6 +66,8 @@ class Operator:
                 )
             case "ARM_TENDONS":
                 flight.tendons.append(TendonsSeen(t, tuple(message.tension)))
+            case "ARM_PAYLOAD":
+                flight.payloads.append(PayloadSeen(t, message.mass, message.mass_sigma, bool(message.valid)))
             case "STATUSTEXT":
                 flight.texts.append((t, message.text))
                 if message.severity <= mav.MAV_SEVERITY_WARNING:
@@ -86,6 +89,14 @@ class Operator:
     async def fly_hang_disarmed(self) -> str:
         """A person disarms the hanging vehicle, arms it again, gives it back and has it leave."""
         return await self._fly(self._hang, self._disarm_and_arm, self._release)
+
+    async def fly_grasp(self) -> str:
+        """An object is picked up twice, without and with the feed-forward, and put back each time."""
+        return await self._fly(self._grasp_uncompensated, self._ready, self._grasp)
+
+    async def fly_grasp_once(self) -> str:
+        """The same with the feed-forward alone, for trials."""
+        return await self._fly(self._grasp)
 
     async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
         failure = ""
@@ -184,6 +195,30 @@ class Operator:
         await self._jog((0.0, 0.0, 0.0))
         await asyncio.sleep(_PULL_S)
 
+    async def _grasp(self) -> None:
+        """Take the object, carry it for a while, and put it back."""
+        self._say("GRASP")
+        await self._pick_and_place(WITH)
+
+    async def _grasp_uncompensated(self) -> None:
+        self._say("GRASP, not compensated")
+        await self._compensate(on=False)
+        await self._pick_and_place(WITHOUT)
+        await self._compensate(on=True)
+
+    async def _ready(self) -> None:
+        await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
+
+    async def _pick_and_place(self, name: str) -> None:
+        start = asyncio.get_running_loop().time()
+        await self._order(mav.MAV_CMD_ARM_GRASP, "GRASP", 150.0)
+        self._mark(name, start)
+        await asyncio.sleep(1.0)
+        await self._measure(CARRIED, (0.0, 0.0, 0.0), _CARRY_S)
+        if self._state() != "CARRY":
+            raise ScenarioFailed(f"the carrying ended by itself in {self._state()}")
+        await self._release()
+
     async def _release(self) -> None:
         self._say("RELEASE")
         await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
@@ -192,9 +227,9 @@ class Operator:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
-        quiet = ("STOWED", "READY", "HOLDING", "HANGING", "HANG_HOLD", "")
+        quiet = ("STOWED", "READY", "HOLDING", "CARRY", "HANGING", "HANG_HOLD", "")
         await self._wait(lambda: self._state() in quiet, 150.0, f"the arm stays in {self._state()}")
-        if self._state() in ("HOLDING", "HANGING", "HANG_HOLD"):
+        if self._state() in ("HOLDING", "CARRY", "HANGING", "HANG_HOLD"):
             await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
         if self._state() == "READY":
             await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
@@ -240,10 +275,13 @@ class Operator:
             await asyncio.sleep(1.0)
 
     async def _measure(self, name: str, asked_w: Vec3, seconds: float) -> None:
-        loop = asyncio.get_running_loop()
-        start = loop.time()
+        start = asyncio.get_running_loop().time()
         await asyncio.sleep(seconds)
-        self._flight.marks.append(Mark(name, start, loop.time(), asked_w))
+        self._mark(name, start, asked_w)
+
+    def _mark(self, name: str, start: float, asked_w: Vec3 = (0.0, 0.0, 0.0)) -> None:
+        """Note what was asked from loop time `start` until now."""
+        self._flight.marks.append(Mark(name, start, asyncio.get_running_loop().time(), asked_w))
 
     async def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
         try:

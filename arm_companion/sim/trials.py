@@ -28,6 +28,7 @@ _BAR_TURNED_DEG = 20.0
 _BAR_ERROR_M = 0.01  # by how much what it is told is wrong, each axis
 _BAR_ERROR_DEG = 2.0
 _WIND_M_PER_S = 2.0
+_MASS_SHARE = (0.75, 1.5)  # of the configured object's
 _CONFIDENCE = 0.95
 _HARM = ("airframe", "propeller", "did not land", "the hanging vehicle")
 _OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
@@ -174,9 +175,49 @@ def draw(config: Config, seed: int) -> Draw:
             ),
         ),
     )
+    if config.sim.object.mass_kg:
+        controller, world = (_with_object(one, config, _others(seed)) for one in (controller, world))
     words = ", ".join(f"{name} {100 * (value - 1):+.0f} %" for name, value in share.items())
+    name = "bar"
+    if (thing := world.sim.object).mass_kg:
+        told = [a - b for a, b in zip(controller.grasp.object_position_m, thing.position_m, strict=True)]
+        name = f"object of {1e3 * thing.mass_kg:.0f} g"
     error = "/".join(f"{1e3 * e:+.0f}" for e in told)
-    return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, bar told {error} mm off")
+    return Draw(controller, world, f"{words}, wind {speed:.1f} m/s, {name} told {error} mm off")
+
+
+def _others(seed: int) -> random.Random:
+    """Numbers of a trial that are drawn for an object, apart from those that every trial draws."""
+    return random.Random(f"object {seed}")  # noqa: S311 - repeatable by design
+
+
+def _with_object(one: Config, config: Config, rng: random.Random) -> Config:
+    """The same object elsewhere and of another weight, both in the world and, with an error, in what is told of it.
+
+    Args:
+        one: configuration of the controller or of the world; both are drawn alike.
+        config: before anything was drawn.
+        rng: of this trial, afresh.
+    """
+    replace = dataclasses.replace
+    thing, grasp = config.sim.object, config.grasp
+    moved = [rng.uniform(-most, most) for most in _BAR_MOVED_M]
+    told = [rng.uniform(-_BAR_ERROR_M, _BAR_ERROR_M) for _ in range(3)]
+    turned, misread = rng.uniform(-_BAR_TURNED_DEG, _BAR_TURNED_DEG), rng.uniform(-_BAR_ERROR_DEG, _BAR_ERROR_DEG)
+    friction = thing.friction * (1.0 + rng.uniform(-MODEL_ERROR, MODEL_ERROR))
+    thing = replace(
+        thing,
+        mass_kg=thing.mass_kg * rng.uniform(*_MASS_SHARE),
+        friction=friction,
+        position_m=tuple(a + b for a, b in zip(thing.position_m, moved, strict=True)),
+        axis_deg=thing.axis_deg + turned,
+    )
+    grasp = replace(
+        grasp,
+        object_position_m=tuple(a + b + e for a, b, e in zip(grasp.object_position_m, moved, told, strict=True)),
+        object_axis_deg=grasp.object_axis_deg + turned + misread,
+    )
+    return replace(one, grasp=grasp, sim=replace(one.sim, object=thing))
 
 
 def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "perch") -> Outcome:
@@ -194,7 +235,8 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
     config = load(file, settings, os.environ)
     drawn = draw(config, seed)
     script = SCENARIOS[scenario]
-    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=script.fly))
+    fly = script.fly_trial or script.fly
+    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=fly))
     verdict = script.judge(result.flight, result.failure, drawn.world)
     samples = result.flight.samples
     most = max((max(sample.truth.tension) for sample in samples), default=0.0)

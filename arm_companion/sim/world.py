@@ -15,7 +15,7 @@ from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.sim.autopilot import AutopilotStandIn
 from arm_companion.sim.plant import Plant, Pose
-from arm_companion.sim.ports import PlantTruth, RigidState
+from arm_companion.sim.ports import PlantTruth, RigidState, Vec3
 from arm_companion.sim.servo_emulator import ServoEmulator
 
 _CONTROL_PERIOD_S = 0.004  # 250 Hz, as PX4 and ArduPilot run their attitude loops and more often than servos answer
@@ -32,6 +32,7 @@ class Sample:
     t: float
     state: RigidState
     truth: PlantTruth
+    asked_w: Vec3 | None = None  # position that the autopilot flies to; None: none, or not in all axes
 
 
 class World:
@@ -69,7 +70,8 @@ class World:
                 self._advance()
                 periods += 1
                 if periods % _SAMPLE_EVERY == 0:
-                    self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth()))
+                    sample = Sample(tick.now, self.plant.state(), self.plant.truth(), self.autopilot.asked_w)
+                    self.samples.append(sample)
             for servo in self.servos.servos:
                 servo.lag_s = loop.time() - start - periods * _CONTROL_PERIOD_S
 

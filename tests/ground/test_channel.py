@@ -1,6 +1,7 @@
 """What is heard of one component, direct and inside TUNNEL, and where private messages go."""
 
 import asyncio
+import json
 import math
 from collections.abc import Callable
 from typing import Any
@@ -10,8 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm_companion.drivers.status_text import LONGEST, status_texts
-from arm_companion.ground.reports import Status, Tendons
+from arm_companion.drivers.targets import read_object
+from arm_companion.ground.reports import Payload, Status, Tendons, as_json
+from arm_companion.ground.screen import summary
 from arm_companion.ground.texts import Sentences
+from arm_companion.mission.motion import rotate
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec, Message
 from arm_companion.protocol.tunnel import tunnel, unwrap
@@ -193,5 +197,34 @@ def test_two_channels_do_not_share_state(scripted: Any) -> None:
     async def main() -> None:
         await asyncio.sleep(0.1)
         assert scripted.channel.system == 1
+
+    scripted.run(main)
+
+
+def test_an_object_is_told_as_the_arm_reads_it(scripted: Any) -> None:
+    scripted.run(lambda: scripted.arm.target_object((3.0, 0.5, -1.5), 0.5, 0.03))
+    (sent,) = scripted.received
+    thing = read_object(sent)
+    assert (thing.position_w, thing.attitude_wo is not None) == ((3.0, 0.5, -1.5), True)
+    assert thing.radius == pytest.approx(0.03)
+    axis = rotate(thing.attitude_wo or (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    assert axis == pytest.approx((math.cos(0.5), math.sin(0.5), 0.0))
+
+
+def test_what_is_carried_is_shown_while_it_is_told(scripted: Any, make_status: Make) -> None:
+    async def main() -> None:
+        scripted.say(make_status("CARRY"))
+        assert scripted.arm.payload is None
+        scripted.say(mav.MAVLink_arm_payload_message(5_000_000, 0.2, 0.014, [0.05, 0.0, 0.12], [0.01] * 3, 1))
+        payload = await scripted.arm.first(Payload)
+        assert (payload.time, payload.valid) == (5.0, True)
+        assert payload.mass == pytest.approx(0.2)
+        assert payload.centre_of_mass == pytest.approx((0.05, 0.0, 0.12))
+        assert "carries 200 ±14 g" in summary(scripted.arm)
+        assert json.loads(json.dumps(as_json(payload)))["mass"] == pytest.approx(0.2)
+        for _ in range(4):  # heard of, but not of this any more
+            await asyncio.sleep(1.0)
+            scripted.say(make_status("STOWED"))
+        assert scripted.arm.payload is None
 
     scripted.run(main)

@@ -14,10 +14,12 @@ from arm_companion.__main__ import main
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.config import load
 from arm_companion.sim import trials
+from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.trials import MODEL_ERROR, Outcome, Summary, draw, kind, wilson
 from arm_companion.sim.world import World
 
 CONFIG = load("sim.toml")
+GRASP = load("sim_grasp.toml")
 
 
 @given(st.integers(0, 10_000))
@@ -39,6 +41,19 @@ def test_the_plant_differs_within_the_model_error_and_the_controller_does_not_kn
     assert max(abs(a - b) for a, b in zip(told, there, strict=True)) <= 0.010 + 1e-9
     assert math.hypot(*drawn.world.sim.wind_m_per_s) <= 2.0
     assert drawn == draw(CONFIG, seed)
+
+
+@given(st.integers(0, 10_000))
+def test_an_object_is_drawn_too_and_told_with_an_error(seed: int) -> None:
+    drawn = draw(GRASP, seed)
+    thing, told = drawn.world.sim.object, drawn.controller.grasp
+    assert drawn.controller.sim.object == thing
+    assert 0.15 <= thing.mass_kg <= 0.3
+    assert abs(thing.friction / GRASP.sim.object.friction - 1.0) <= MODEL_ERROR
+    errors = [a - b for a, b in zip(told.object_position_m, thing.position_m, strict=True)]
+    assert max(map(abs, errors)) <= 0.010 + 1e-9
+    assert abs(told.object_axis_deg - thing.axis_deg) <= 2.0
+    assert draw(CONFIG, seed).world.sim.object == CONFIG.sim.object, "where there is none, none is drawn"
 
 
 def test_seeds_differ_and_the_plant_takes_its_own_values() -> None:
@@ -101,15 +116,17 @@ class Pool:
         pass
 
     def submit(self, _: Any, __: str, ___: tuple[str, ...], seed: int, scenario: str) -> "Future[Outcome]":
+        assert scenario in SCENARIOS
         future: Future[Outcome] = Future()
         good = seed != 8
         future.set_result(Outcome(seed, good, "" if good else "no contact 6 cm past it", "", f"drawn for {scenario}"))
         return future
 
 
-@pytest.mark.parametrize(("scenario", "seed", "code"), [("perch", 1, 0), ("perch", 7, 1), ("hang", 7, 1)])
+@pytest.mark.parametrize("scenario", ["perch", "hang", "grasp"])
+@pytest.mark.parametrize(("seed", "code"), [(1, 0), (7, 1)])
 def test_the_command_line_prints_the_contract_and_says_by_its_exit_code_whether_all_succeeded(
-    scenario: str, seed: int, code: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    seed: int, code: int, scenario: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(trials, "ProcessPoolExecutor", Pool)
     words = ["sim", scenario, "--simulated", "--trials", "4", "--jobs", "2", "--seed", str(seed), "--json"]

@@ -24,6 +24,7 @@ HOVER = VehicleState(
     attitude_age_s=0.01,
     throttle=0.5,
     throttle_age_s=0.05,
+    thrust=0.5,
 )
 
 

@@ -11,7 +11,7 @@ from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import MOVES_VEHICLE, Anchor, Phase, Sharing, State
+from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, Anchor, Phase, Sharing, State
 
 DT = 0.01
 T0 = 100.0
@@ -19,8 +19,8 @@ PLACE = (2.0, 0.0, -2.2)
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
 HUNG = Sharing(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
-HELD = frozenset({Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}) | SUSPENDED
-"""Phases in which the arm is around the bar."""
+HELD = CARRYING | SUSPENDED | {Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}
+"""Phases in which the arm is around the bar, or around the object."""
 
 Change = Callable[[Facts], Facts]
 
@@ -41,6 +41,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "anchor": ANCHOR if held else None,
         "sharing": HUNG if phase in SUSPENDED else Sharing(),
         "tension": (8.0, 4.0, 1.0, 4.0),
+        "task": Order.GRASP if phase in CARRYING | {Phase.CLOSE} else Order.PERCH,
         "bend": bend,
         "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
     }
@@ -123,7 +124,7 @@ class Run:
             assert math.hypot(*state.bend) <= limits.bend_max_rad + 1e-9 or math.hypot(*before.bend) >= math.hypot(
                 *state.bend
             )
-        if state.since == before.since and state.pulls and before.pulls:
+        if (state.phase, state.since) == (before.phase, before.since) and state.pulls and before.pulls:
             turned = math.hypot(state.bend[0] - before.bend[0], state.bend[1] - before.bend[1])
             assert turned <= perch.bend_speed_rad_per_s * 0.1 + 1e-9
         assert not commands.recover or state.phase in {Phase.STARTUP, Phase.STOWED}

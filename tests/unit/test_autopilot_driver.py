@@ -21,7 +21,7 @@ PX4, ARDUPILOT = mav.MAV_AUTOPILOT_PX4, mav.MAV_AUTOPILOT_ARDUPILOTMEGA
 OFFBOARD = 6 << 16
 GUIDED = 4
 SETPOINT = Setpoint((1.0, 2.0, -3.0), (0.1, 0.2, 0.3), (0.5, 0.6, 0.7), 1.5)
-STREAMS = {31: 100.0, 32: 100.0, 245: 5.0, 74: 10.0}
+STREAMS = {31: 100.0, 32: 100.0, 83: 50.0, 245: 5.0, 74: 10.0}
 Peer = Any
 
 
@@ -50,6 +50,10 @@ class Rig:
     def position(self, *values: float) -> None:
         self.peer.send(mav.MAVLink_local_position_ned_message(self.boot_ms, *values))
 
+    def thrust(self, share: float) -> None:
+        upright = (1.0, 0.0, 0.0, 0.0)
+        self.peer.send(mav.MAVLink_attitude_target_message(self.boot_ms, 0, upright, 0.0, 0.0, 0.0, share))
+
     async def stream(self, seconds: float, *, position: bool = True, heartbeat: bool = True) -> None:
         """Everything at its rate, as an autopilot does once asked."""
         for i in range(round(seconds * 100)):
@@ -57,6 +61,8 @@ class Rig:
             self.attitude(1.0, 0.0, 0.0, 0.0)
             if position:
                 self.position(1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
+            if i % 2 == 0:
+                self.thrust(0.5)
             if i % 20 == 0:
                 self.peer.send(mav.MAVLink_extended_sys_state_message(0, mav.MAV_LANDED_STATE_IN_AIR))
             if i % 10 == 0:
@@ -344,5 +350,22 @@ def test_a_setpoint_that_is_no_number_never_leaves(fly: Callable[..., None], bad
             rig.autopilot.send(bad, 1.0)
         await asyncio.sleep(0.1)
         assert rig.peer.all("SET_POSITION_TARGET_LOCAL_NED") == []
+
+    fly(body)
+
+
+def test_thrust_is_told_while_it_is_young_and_is_a_share(fly: Callable[..., None]) -> None:
+    async def body(rig: Rig) -> None:
+        assert math.isnan(rig.state.thrust)
+        await rig.stream(0.1)
+        assert rig.state.thrust == 0.5
+        for impossible in (math.nan, -0.1, 1.5, math.inf):
+            rig.boot_ms += 10
+            rig.thrust(impossible)
+        await asyncio.sleep(0.01)
+        assert rig.state.thrust == 0.5
+        assert rig.autopilot.counters.invalid == 4
+        await asyncio.sleep(0.5)
+        assert math.isnan(rig.state.thrust), "an old share is none"
 
     fly(body)

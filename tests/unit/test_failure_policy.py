@@ -26,13 +26,20 @@ from arm_companion.mission.facts import (
     WrenchSource,
 )
 from arm_companion.mission.failure_policy import CAUSES, SITUATIONS, Cause, document, reaction
+from arm_companion.mission.motion import Reference
+from arm_companion.mission.payload import Load, ThrustCurve
+from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, Prediction, State
+from arm_companion.mission.state import CARRYING, Phase, Prediction, State
 from arm_companion.mission.tendon_watch import TendonWatch
 from tests.unit.conftest import tendons
-from tests.unit.mission_rig import BENT, HELD, T0, Change, Run, ask, memory, moved, tendon, vehicle
+from tests.unit.mission_rig import BENT, HELD, PLACE, T0, Change, Run, ask, memory, moved, tendon, vehicle
 
 Hovering = Callable[..., Facts]
+
+
+DEEP = 0.06
+"""How far below the pick-up a load is looked to be set down, m."""
 
 
 class Blind(RodModel):
@@ -83,8 +90,29 @@ def _loose_wrap(state: State) -> State:
     return dataclasses.replace(state, since=T0 - 20.0, bend=(4.9, 0.0), bend_goal=(4.9, 0.0))
 
 
+def weighed(state: State, kilograms: float) -> State:
+    """Memory of a load that was weighed, and whose rotors hover without one at the facts' thrust."""
+    load = Load(ThrustCurve.prior(0.5), None, 5.0, 0.0, mass=kilograms, weighed_s=5.0 if kilograms else 0.0)
+    return dataclasses.replace(state, load=load)
+
+
 def _lost_contact(state: State) -> State:
-    return _loose_wrap(state) if state.phase is Phase.WRAP else _slip(state)
+    if state.phase in CARRYING:
+        x, y, z = PLACE
+        return weighed(dataclasses.replace(state, position=(x, y, z - 0.3), reference=Reference((x, y, z - 0.3))), 0.2)
+    if state.phase in SUSPENDED:
+        x, y, z = PLACE
+        hung = dataclasses.replace(state.sharing, place=(x, y, z - 0.6), first=z - 0.6)  # it has sunk since
+        return dataclasses.replace(state, sharing=hung)
+    return _loose_wrap(state) if state.phase in (Phase.WRAP, Phase.CLOSE) else _slip(state)
+
+
+def _at_the_bottom(state: State) -> State:
+    x, y, z = PLACE
+    reference = Reference((x, y, z + DEEP))
+    state = weighed(dataclasses.replace(state, since=T0 - 3.0, reference=reference), 0.2)
+    lighter = ThrustCurve.prior(0.46)  # at the thrust of the facts these rotors lift a load
+    return dataclasses.replace(state, load=dataclasses.replace(state.load, curve=lighter, flow=None))
 
 
 def _slack(facts: Facts) -> Facts:
@@ -122,10 +150,18 @@ PROVOCATIONS: dict[str, Provocation] = {
         "tendon 1 jumped",
         recall=_remember(watch=(TendonWatch(jumped="tendon 1 jumped"), _SUSPECT, _SUSPECT, _SUSPECT)),
     ),
-    "contact lost": Provocation("no grip|pull test failed|grip lost|slip", moved((-0.2, 0.0, 0.2)), _lost_contact),
+    "contact lost": Provocation(
+        "no grip|closed around nothing|pull test failed|grip lost|load lost|slip",
+        moved((-0.2, 0.0, -0.3)),
+        _lost_contact,
+        seconds=0.15,
+    ),
+    "nothing below to set a load down on": Provocation("nothing found", moved((0.0, 0.0, DEEP)), _at_the_bottom),
     "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
-    "stiffness test failed": Provocation("no grip|pull test failed", moved((-0.04, 0.0, 0.0)), _lost_contact),
+    "stiffness test failed": Provocation(
+        "no grip|closed around nothing|pull test failed", moved((-0.04, 0.0, 0.0)), _lost_contact
+    ),
     "wrench over its limit": Provocation(
         "on the airframe",
         recall=_remember(prediction=Prediction(T0, _WRENCH, (0, 0, 0.25), (0, 0), (0, 0, 0))),

@@ -22,6 +22,8 @@ from arm_companion.mission.facts import (
     SetpointKind,
     VehicleState,
 )
+from arm_companion.mission.hazards import vehicle_lost
+from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
@@ -49,6 +51,7 @@ VEHICLES = st.builds(
     attitude_age_s=AGES,
     throttle=st.floats(0.0, 1.0),
     throttle_age_s=AGES,
+    thrust=st.sampled_from((0.5, 0.5, 0.3, 0.6, 1.0, 0.0, math.nan)),
 )
 TENDON = st.fixed_dictionaries(
     {
@@ -177,6 +180,8 @@ def test_every_phase_that_moves_the_vehicle_has_an_answer_to_its_loss(phase: Pha
     labels = {row.label for row in TABLE.transitions if phase in row.sources}
     if phase is Phase.RELEASE:
         assert "vehicle not ours" in labels, "half a grip is no grip: it goes on opening, and leaves the vehicle alone"
+    elif phase is Phase.CARRY:
+        assert any(phase in told.phases and told.guard is vehicle_lost for told in WARNINGS), "it holds, and says so"
     else:
         assert "vehicle lost" in labels
     assert labels & {"disarmed", "motors stop"}

@@ -1,0 +1,183 @@
+"""What carrying does in each cycle: the load is weighed, lifted with a push of its own, and set down again."""
+
+import dataclasses
+import math
+
+import numpy as np
+
+from arm_companion.arm.model import Payload
+from arm_companion.arm.reaction import GRAVITY
+from arm_companion.mission.facts import PayloadReport, Vec3
+from arm_companion.mission.grasp import LIGHT_SHARE, low
+from arm_companion.mission.motion import ZERO, add, norm, scale, sub
+from arm_companion.mission.payload import Load, interrupted, watch_load, weigh
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import CARRYING, Anchor, Phase, State
+
+_UNTOUCHED = frozenset(
+    {
+        Phase.STOWED,
+        Phase.READYING,
+        Phase.READY,
+        Phase.APPROACH,
+        Phase.REACH,
+        Phase.CONTACT,
+        Phase.DEPART,
+        Phase.STOWING,
+    }
+)
+"""Phases in which the rotors lift the vehicle alone."""
+
+_OPEN_SHARE = 0.5  # of the wrap, up to which the arm is still clear of the object
+_NEAR_GROUND_M = 0.1
+_SLOWLY = 0.3  # share of the speed there
+_ABOVE_M = 0.03
+_STEADY_S = 2.5  # until a vehicle that the closing arm has pulled about rests again
+_FOLLOW_S = 0.5
+_TOUCHING_SHARE = 0.7
+_TEST_SHARE = 0.2  # of the lifting speed: the load comes on within millimetres, and the push has to keep up with it
+_LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
+_LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
+_GRIP_S = 1.0
+_GRIP_SIGMA = (0.015, 0.03, 0.015)  # m, base axes: along the bend, along the object's axis, along the arm
+
+
+def track_load(s: Situation) -> Load:
+    """The load after this cycle; a mean begins anew with every lift."""
+    state = s.state
+    if not s.vehicle_fresh:
+        return interrupted(state.load)
+    share = math.hypot(*state.bend) / s.config.perch.wrap_bend_rad
+    lifted: float | None = None
+    if state.phase in _UNTOUCHED or (state.phase is Phase.CLOSE and share < _OPEN_SHARE):
+        lifted = 0.0
+    elif state.phase is Phase.CARRY and state.load.settled and not state.load.light_s:
+        lifted = state.load.mass  # whatever the rotors need more from now on is the battery's fault
+    load = watch_load(state.load, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt, lifted=lifted)
+    tightest = max(s.tensions, default=0.0)
+    share = _LOOSE_LIGHT_SHARE if tightest < _LOOSE_SHARE * load.grip else LIGHT_SHARE
+    # before it is weighed, what the test lift found at least
+    little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
+    light = state.phase in CARRYING and load.now < little
+    grip = load.grip + s.dt / (_GRIP_S + s.dt) * (tightest - load.grip) if state.phase in CARRYING else 0.0
+    load = dataclasses.replace(load, grip=grip, light_s=load.light_s + s.dt if light else 0.0)
+    return weigh(load, s.dt) if state.phase in (Phase.LIFT, Phase.CARRY) and not light else load
+
+
+def prepare(s: Situation) -> State:
+    """Memory at the entry of the present phase of a grasp, after what it has in common with a perch."""
+    state = s.state
+    match state.phase:
+        case Phase.APPROACH:  # from here on the way back is known, whatever comes
+            return dataclasses.replace(state, contact_w=s.place(0.0))
+        case Phase.VERIFY:  # from here the object is lifted, and here it is set down again
+            place = state.position
+            anchor = Anchor(place, s.facts.vehicle.attitude_wb, state.tension)
+            test = (0.0, 0.0, -s.config.grasp.verify_lift_m)
+            reference = None if state.reference is None else dataclasses.replace(state.reference, position=place)
+            return dataclasses.replace(
+                state, anchor=anchor, rest=place, offset=test, bend_goal=state.bend, reference=reference
+            )
+        case Phase.LIFT:  # what the object weighs is found anew
+            load = dataclasses.replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0)
+            return dataclasses.replace(state, offset=ZERO, load=load)
+        case Phase.RELEASE if state.anchor is not None:  # of a closed arm, wherever that is: out as it came in
+            closed = state.position  # where it rests on the object, and not where it was asked to sink to
+            contact = sub(closed, scale(s.straight_w, s.config.perch.contact_arc_m))
+            return dataclasses.replace(state, contact_w=contact, anchor=None)
+    return state
+
+
+def settle(s: Situation) -> State:
+    """Memory while a closed arm comes to rest on its object: the set-point follows the vehicle, so nothing winds up."""
+    state = s.state
+    if state.phase is not Phase.VERIFY or s.elapsed >= _STEADY_S or state.anchor is None or not s.vehicle_fresh:
+        return state
+    rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
+    return dataclasses.replace(state, rest=rest, anchor=dataclasses.replace(state.anchor, position_w=rest))
+
+
+def goal(s: Situation) -> tuple[Vec3, float]:
+    """Where the reference goes with a load, and how fast."""
+    grasp = s.config.grasp
+    if s.state.phase is Phase.VERIFY:
+        if s.elapsed < _STEADY_S:
+            return s.rest, grasp.lift_speed_m_per_s
+        return add(s.rest, s.state.offset), _TEST_SHARE * grasp.lift_speed_m_per_s
+    if s.state.phase is Phase.LIFT:
+        return add(s.probe, (0.0, 0.0, -grasp.lift_height_m)), grasp.lift_speed_m_per_s
+    if s.state.feedforward and s.state.reference is not None and _touching_down(s):
+        return s.state.reference.position, grasp.lift_speed_m_per_s
+    down, here = s.setting_down, s.facts.vehicle.position_w
+    if norm((down[0] - here[0], down[1] - here[1], 0.0)) > _ABOVE_M and down[2] - here[2] > _NEAR_GROUND_M:
+        return (down[0], down[1], s.state.reference.position[2] if s.state.reference else here[2]), (
+            grasp.lift_speed_m_per_s
+        )
+    share = _SLOWLY if s.probe[2] - here[2] < _NEAR_GROUND_M else 1.0
+    return down, share * grasp.lift_speed_m_per_s
+
+
+def _touching_down(s: Situation) -> bool:
+    """Whether some of the load is off, near the height at which it was taken: the push does the rest."""
+    load = s.state.load
+    return low(s) and load.known and load.now < _TOUCHING_SHARE * load.mass
+
+
+def push(s: Situation) -> Vec3:
+    """Acceleration to ask for that holds the load up, m/s^2, world axes.
+
+    Once weighed, the load is what it is. While it comes on or goes off, it is what the rotors lift at this moment;
+    that is no feedback of a held arm's force, since nothing but the object's own weight is behind it, and never
+    more than may be lifted.
+    """
+    load, grasp = s.state.load, s.config.grasp
+    if s.state.phase is Phase.VERIFY and s.elapsed < _STEADY_S:
+        return ZERO  # it would lift the object before the vehicle is asked up
+    if load.known and s.state.phase in (Phase.LIFT, Phase.CARRY):
+        mass = load.mass
+    elif math.isnan(load.now):
+        mass = load.mass if load.known and s.state.phase in CARRYING else 0.0
+    else:
+        mass = min(max(load.now, 0.0), load.mass if load.known and s.state.phase is Phase.PLACE else grasp.mass_max_kg)
+    gain = 1.0 if load.curve is None else load.curve.gain
+    return (0.0, 0.0, -mass * GRAVITY / s.config.vehicle.mass_kg / gain)
+
+
+def payload(s: Situation) -> Payload | None:
+    """What the arm carries, for the mechanics; None while it is not known.
+
+    A closed arm is a circle around the object, so the object's middle is at its centre: one radius from the tip,
+    towards the side to which the arm is bent.
+    """
+    load = s.state.load
+    if s.state.phase not in CARRYING or not load.known:
+        return None
+    x, y = s.towards_bar_a
+    coming_off = s.state.phase is Phase.PLACE and math.isfinite(load.now)
+    mass = min(load.mass, load.now) if coming_off else load.mass
+    return Payload(max(mass, 0.0), _loop_radius(s) * np.array((x, y, 0.0)))
+
+
+def report(s: Situation) -> PayloadReport | None:
+    """ARM_PAYLOAD of this cycle; None while nothing is carried."""
+    load = s.state.load
+    if s.state.phase not in CARRYING or not load.weighed_s:
+        return None
+    x, y = s.towards_bar_a
+    R, radius = s.mount.rotation, _loop_radius(s)
+    centre = s.mount.position + R @ (radius * x, radius * y, 0.0)
+    along, across, down = _GRIP_SIGMA
+    spread = (math.hypot(along * x, across * y), math.hypot(along * y, across * x), down)
+    sigma = [math.sqrt(sum((R[i, j] * spread[j]) ** 2 for j in range(3))) for i in range(3)]
+    return PayloadReport(
+        load.mass,
+        load.sigma(s.config.vehicle.mass_kg),
+        (float(centre[0]), float(centre[1]), float(centre[2])),
+        (sigma[0], sigma[1], sigma[2]),
+        valid=load.known,
+    )
+
+
+def _loop_radius(s: Situation) -> float:
+    """Radius of the closed arm's middle line, m."""
+    return s.parameters.model.parameters.L / s.config.perch.wrap_bend_rad

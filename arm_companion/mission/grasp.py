@@ -1,0 +1,198 @@
+"""The rows that the grasp adds to the table: close around an object, lift it, carry it, set it down.
+
+The way to the object and back is the perch's own (`perch`). What is carried is let go in two ways only: set down,
+when the rotors say that the load is off; or from HOLDING, when a person says so.
+"""
+
+import math
+
+from arm_companion.mission.facts import ArmFault, Order
+from arm_companion.mission.hazards import (
+    astray,
+    disarmed,
+    estimator_jumped,
+    failsafe,
+    pilot_takes_over,
+    vehicle_lost,
+)
+from arm_companion.mission.machine import OrderRow, Transition
+from arm_companion.mission.motion import arrived, norm
+from arm_companion.mission.refusals import cannot_set_out
+from arm_companion.mission.situation import Situation, at
+from arm_companion.mission.state import CARRYING, Phase
+
+Row = Transition[Phase, Situation]
+Ask = OrderRow[Phase, Situation]
+
+LIGHT_SHARE = 0.5
+"""Of the weighed load, under which it counts as gone."""
+
+_DROPPED_S = 0.1
+_SET_DOWN_S = 0.4
+_AT_GROUND_M = 0.05
+_LOWEST_M = 0.02
+_RISEN_SHARE = 0.6
+_SETTLE_S = 1.0
+_JUDGED_S = 6.0
+_LIFTED_M = 0.08
+_STILL_S = 2.0
+_NO_LEAN = 0.15  # m/s^2
+
+_SINKING = frozenset({Phase.LIFT, Phase.PLACE})
+
+
+# --- guards: what goes wrong ---
+
+
+def taken_over_while_setting_down(s: Situation) -> str | None:
+    """The autopilot left our mode in this cycle; who sets down by hand had it before, and is left to it."""
+    return pilot_takes_over(s) if s.pilot_took_over else None
+
+
+def dropped(s: Situation) -> str | None:
+    """The load has left the arm, in the air."""
+    load = s.state.load
+    if load.light_s < _DROPPED_S or (s.state.phase is Phase.PLACE and (low(s) or not s.external)):
+        return None
+    return f"load lost: {load.mass:.2f} kg were carried, {max(load.now, 0.0):.2f} kg are left"
+
+
+def not_closed(s: Situation) -> str | None:
+    """The arm is wrapped as far as allowed, yet no tendon carries the tension of a closed one."""
+    perch = s.config.perch
+    around = s.state.bend == s.state.bend_goal
+    if not around or s.elapsed < perch.wrap_bend_rad / perch.bend_speed_rad_per_s + _SETTLE_S or closed(s) is not None:
+        return None
+    return f"closed around nothing: {max(s.state.tension):.1f} N, {s.config.grasp.grip_tension_n:g} N are needed"
+
+
+def lift_failed(s: Situation) -> str | None:
+    """The test lift went up with nothing, or pulled more than may be lifted."""
+    now, grasp = s.state.load.now, s.config.grasp
+    if not s.grasping or s.elapsed < _SETTLE_S:
+        return None
+    if math.isnan(now):
+        return "test lift failed: the thrust is not known"
+    if now > grasp.mass_max_kg:
+        return f"test lift failed: {now:.2f} kg and more, at most {grasp.mass_max_kg:g} kg are lifted"
+    if s.elapsed > _JUDGED_S and risen(s) and now < grasp.mass_min_kg:
+        return f"test lift failed: {max(now, 0.0):.2f} kg on the arm"
+    return None
+
+
+def nothing_below(s: Situation) -> str | None:
+    """The vehicle has gone down as far as it may, and the load is still on the arm."""
+    reference = s.state.reference
+    if reference is None or not s.external or s.elapsed < _STILL_S or s.state.load.light_s or not lowest(s):
+        return None
+    return None if math.isnan(s.state.load.now) else "nothing found to set the load down on"
+
+
+def takes_too_long(s: Situation) -> str | None:
+    """Lifting or setting down lasts longer than its way needs."""
+    grasp = s.config.grasp
+    limit = s.config.perch.state_timeout_s + grasp.lift_height_m / grasp.lift_speed_m_per_s
+    return f"{s.state.phase.name.lower()} took more than {limit:g} s" if s.elapsed > limit else None
+
+
+# --- guards: what goes well ---
+
+
+def closed(s: Situation) -> str | None:
+    """Some tendon carries a closed arm's tension with the wrap complete."""
+    most = max(s.state.tension)
+    done = s.state.bend == s.state.bend_goal and most >= s.config.grasp.grip_tension_n
+    return f"closed with {most:.1f} N" if done else None
+
+
+def lift_passed(s: Situation) -> str | None:
+    """The vehicle has gone up, and its rotors lift more than itself."""
+    if not s.grasping or s.elapsed < _SETTLE_S or not risen(s) or not s.state.load.now >= s.config.grasp.mass_min_kg:
+        return None
+    return f"test lift passed: {s.state.load.now:.2f} kg"
+
+
+def lifted(s: Situation) -> str | None:
+    """The vehicle rests where the load is to be carried."""
+    reference = s.state.reference
+    up = reference is not None and norm(reference.velocity) == 0.0 and s.elapsed > _SETTLE_S
+    return "lifted" if up and reference is not None and at(s, reference.position, _LIFTED_M) else None
+
+
+def set_down(s: Situation) -> str | None:
+    """The load is off; where the thrust is not known, the vehicle rests as low as where it took the object."""
+    load = s.state.load
+    if load.light_s >= _SET_DOWN_S and norm(s.state.lean) < _NO_LEAN and (low(s) or not s.external):
+        return "set down: the load is off"
+    if math.isnan(load.now) and s.external and s.elapsed > _STILL_S and lowest(s):
+        return "set down at the height of the pick-up; the thrust is not known"
+    return None
+
+
+def risen(s: Situation) -> bool:
+    """Whether the vehicle has made most of the test lift."""
+    return s.probe[2] - s.state.position[2] >= _RISEN_SHARE * s.config.grasp.verify_lift_m
+
+
+def low(s: Situation) -> bool:
+    """Whether the vehicle is about as low as where it took the object."""
+    return s.probe[2] - s.state.position[2] < _AT_GROUND_M
+
+
+def lowest(s: Situation) -> bool:
+    """Whether the reference rests at its lowest, and the vehicle with it."""
+    reference = s.state.reference
+    if reference is None or not arrived(reference, s.setting_down):
+        return False
+    return at(s, reference.position, _LOWEST_M)
+
+
+# --- orders ---
+
+
+def cannot_grasp(s: Situation) -> str | None:
+    """Why a grasp cannot begin now."""
+    if (reason := cannot_set_out(s, s.object, "object")) is not None:
+        return reason
+    if math.isnan(s.facts.vehicle.thrust):
+        return "the autopilot does not tell its thrust (ATTITUDE_TARGET), so a load cannot be weighed"
+    return None if s.state.load.calibrated else "the thrust of a hover is not known yet: hover for some seconds"
+
+
+ORDERS: tuple[Ask, ...] = (
+    Ask(Order.GRASP, frozenset({Phase.READY}), Phase.APPROACH, frozenset({Phase.CARRY}), cannot_grasp),
+    Ask(Order.RELEASE, frozenset({Phase.LIFT, Phase.CARRY}), Phase.PLACE, frozenset({Phase.STOWED})),
+    # nobody but a person lets go of a load: it is held where it is
+    Ask(Order.ABORT, CARRYING, Phase.CARRY, frozenset({Phase.CARRY})),
+    # set-points go out again after a pilot had the vehicle
+    Ask(Order.READY, frozenset({Phase.CARRY}), Phase.CARRY, frozenset({Phase.CARRY})),
+)
+
+ABORTS: tuple[Row, ...] = (
+    Row(frozenset({Phase.LIFT}), pilot_takes_over, Phase.CARRY, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
+    Row(
+        frozenset({Phase.PLACE}),
+        taken_over_while_setting_down,
+        Phase.CARRY,
+        "pilot takes over",
+        ArmFault.PILOT_TOOK_OVER,
+    ),
+    Row(_SINKING, failsafe, Phase.CARRY, "autopilot failsafe", ArmFault.AUTOPILOT_FAILSAFE),
+    Row(_SINKING, vehicle_lost, Phase.CARRY, "vehicle lost", ArmFault.VEHICLE_LOST),
+    Row(CARRYING, disarmed, Phase.HOLDING, "disarmed", ArmFault.DISARMED),
+    Row(_SINKING, estimator_jumped, Phase.CARRY, "estimator jump", ArmFault.ESTIMATOR_JUMP),
+    Row(_SINKING, astray, Phase.CARRY, "set-points not followed", ArmFault.SETPOINT_REJECTED),
+    Row(CARRYING, dropped, Phase.HOLDING, "load lost", ArmFault.CONTACT_LOST),
+)
+
+PROGRESS: tuple[Row, ...] = (
+    Row(frozenset({Phase.CLOSE}), closed, Phase.VERIFY, "closed"),
+    Row(frozenset({Phase.CLOSE}), not_closed, Phase.UNLOAD, "not closed", ArmFault.GRIP_TEST_FAILED),
+    Row(frozenset({Phase.VERIFY}), lift_failed, Phase.UNLOAD, "test lift failed", ArmFault.GRIP_TEST_FAILED),
+    Row(frozenset({Phase.VERIFY}), lift_passed, Phase.LIFT, "test lift passed"),
+    Row(frozenset({Phase.LIFT}), lifted, Phase.CARRY, "lifted"),
+    Row(frozenset({Phase.PLACE}), set_down, Phase.RELEASE, "load is off"),
+    Row(frozenset({Phase.PLACE}), nothing_below, Phase.CARRY, "nothing below", ArmFault.NO_CONTACT),
+)
+
+TIME_LIMITS: tuple[Row, ...] = (Row(_SINKING, takes_too_long, Phase.CARRY, "time limit", ArmFault.TIMEOUT),)

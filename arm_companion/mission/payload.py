@@ -1,0 +1,245 @@
+"""How much the arm carries, weighed with the vehicle's own thrust.
+
+A multirotor tells the thrust that it asks of its rotors as a share without unit (ATTITUDE_TARGET.thrust). What that
+share is worth is found in free flight, where the vehicle's mass is all that it lifts. With u the share, c the cosine
+of the tilt, and v the speed downwards,
+
+    g - dv/dt = c (a + b (u - u_0)) + d v                                                     (free flight)
+
+has three unknowns: a, what the rotors lift while hovering, which drifts as the battery empties; b, how steep the
+curve of the rotors is, with whatever makes the supply sag; d, the drag. A Kalman filter finds them. Whatever
+the thrust then is beyond the weight of the vehicle m is load:
+
+    (m + load) (g - dv/dt) = m (c (a + b (u - u_0)) + d v)                                    (carrying)
+
+The derivative is never taken: all signals pass the same low-pass filter, w' = p (v - w), which gives dv/dt as it is.
+What is asked of the rotors passes one that is slower by their own lag.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from arm_companion.arm.reaction import GRAVITY
+from arm_companion.geometry.arrays import Array
+from arm_companion.mission.facts import VehicleState
+from arm_companion.mission.motion import rotate
+
+_POLE = 6.0  # rad/s, of the low-pass filter
+_ROTOR_LAG_S = 0.03  # from the thrust asked for to the thrust, as rotors of a foot have
+_SPECTRUM = 1.5e-3  # m^2/s^3: an acceleration known to 0.05 m/s^2, with errors that last 0.3 s
+_DRIFT = 0.01  # m/s^2 per root second, of what the rotors lift at the same share
+_PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line through zero
+_PRIOR_DRAG = 0.14  # 1/s
+_PRIOR_SIGMA = (1.0, 0.35, 0.1)  # of a, m/s^2; of the slope, in the same terms; of the drag
+_LEAST_SHARE = 0.05  # rotors that idle say nothing
+_UPRIGHT = 0.7  # cosine of the greatest tilt at which a hover is a hover
+_SETTLE_S = 1.0  # after the take-off or a gap, until the filter and the ground are left behind
+_GAINS = (0.7, 2.0)  # what a curve of rotors can do
+_LEAST_SLOPE = 1.0  # m/s^2
+_CALIBRATED = 0.1  # m/s^2, one sigma of a that is good enough to weigh with
+_MASS_SPREAD = 0.05  # one sigma of the vehicle's configured mass, relative
+_WEIGHED_S = 1.5  # of averaging, until a weight counts
+_ENOUGH_S = 8.0  # of averaging, from which on the weight is known, and drift is that of the battery
+
+Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """What the vehicle does with its thrust, each after the low-pass filter.
+
+    Attributes:
+        up: c, cosine of the tilt.
+        push: u c, the upward part of the share of thrust.
+        sink: v, speed downwards, m/s.
+    """
+
+    up: float
+    push: float
+    sink: float
+
+
+@dataclass(frozen=True, slots=True)
+class ThrustCurve:
+    """What the rotors lift at a share of thrust, per kilogram of the vehicle.
+
+    Attributes:
+        at: u_0, the share around which it is known.
+        theta: a (m/s^2), b (m/s^2) and d (1/s).
+        covariance: of theta.
+    """
+
+    at: float
+    theta: tuple[float, float, float]
+    covariance: Covariance
+
+    @classmethod
+    def prior(cls, at: float) -> "ThrustCurve":
+        """What is known of a hover at the share `at` before anything was measured."""
+        slope = GRAVITY / at
+        sigma = (_PRIOR_SIGMA[0], _PRIOR_SIGMA[1] * slope, _PRIOR_SIGMA[2])
+        theta = (GRAVITY, _PRIOR_SLOPE * slope, _PRIOR_DRAG)
+        return cls(at, theta, _rows(np.diag(np.square(sigma))))
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether enough of a hover has been seen to weigh with."""
+        return self.covariance[0][0] <= _CALIBRATED**2
+
+    @property
+    def gain(self) -> float:
+        """Acceleration that comes of one that is asked for, by an autopilot that takes thrust for proportional.
+
+        Both flight stacks ask for the share u_h (1 + a / g) to accelerate by a, where u_h is that of their hover.
+        """
+        a, b, _ = self.theta
+        hover = self.at + (GRAVITY - a) / max(b, _LEAST_SLOPE)
+        return min(max(b * hover / GRAVITY, _GAINS[0]), _GAINS[1])
+
+    def lift(self, flow: Flow) -> float:
+        """c (a + b (u - u_0)) + d v, m/s^2."""
+        return float(self._regressor(flow) @ np.array(self.theta))
+
+    def sigma(self, flow: Flow) -> float:
+        """One sigma of `lift`, m/s^2."""
+        h = self._regressor(flow)
+        return math.sqrt(max(float(h @ np.array(self.covariance) @ h), 0.0))
+
+    def learn(self, flow: Flow, felt: float, dt: float) -> "ThrustCurve":
+        """The curve after `dt` seconds in which the rotors lifted the vehicle's mass by `felt` = g - dv/dt, m/s^2."""
+        h = self._regressor(flow)
+        P = np.array(self.covariance)
+        P[0, 0] += _DRIFT**2 * dt
+        Ph = P @ h
+        gain = Ph / (h @ Ph + _SPECTRUM / dt)
+        theta = np.array(self.theta) + gain * (felt - self.lift(flow))
+        P -= np.outer(gain, Ph)
+        return replace(self, theta=_three(theta), covariance=_rows(0.5 * (P + P.T)))
+
+    def _regressor(self, flow: Flow) -> Array:
+        return np.array((flow.up, flow.push - self.at * flow.up, flow.sink))
+
+    def forget(self, dt: float) -> "ThrustCurve":
+        """The curve after `dt` seconds in which nothing could be learnt, and the battery went on emptying."""
+        first, *rest = self.covariance
+        return replace(self, covariance=((first[0] + _DRIFT**2 * dt, first[1], first[2]), rest[0], rest[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class Load:
+    """The load on the arm, as far as thrust tells.
+
+    Attributes:
+        curve: of the rotors; None until the vehicle has been seen to hover.
+        flow: what goes into the curve; None: no signal yet.
+        seen_s: how long the filter has been running without a gap.
+        now: load of this moment, kg, behind by the filter; nan: it cannot be told.
+        mass: mean while the load was carried, kg.
+        spread: one sigma of what the curve said while it was weighed, m/s^2.
+        weighed_s: length of that mean, s.
+        grip: tension of the tightest tendon while carrying, N, smoothed.
+        light_s: how long `now` has been too little for the mean.
+    """
+
+    curve: ThrustCurve | None = None
+    flow: Flow | None = None
+    seen_s: float = 0.0
+    now: float = math.nan
+    mass: float = 0.0
+    spread: float = 0.0
+    weighed_s: float = 0.0
+    grip: float = 0.0
+    light_s: float = 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether there is a weight that may be acted upon."""
+        return self.weighed_s >= _WEIGHED_S
+
+    @property
+    def settled(self) -> bool:
+        """Whether the weight does not change any more."""
+        return self.weighed_s >= _ENOUGH_S
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether a load can be weighed now."""
+        return self.curve is not None and self.curve.calibrated and math.isfinite(self.now)
+
+    def sigma(self, vehicle_mass: float) -> float:
+        """One sigma of `mass`, kg: of the curve, of the mean, and of the mass of the vehicle that all is counted in."""
+        if not self.weighed_s:
+            return math.inf
+
+        per = vehicle_mass / GRAVITY
+        return math.hypot(
+            per * self.spread,
+            per * math.sqrt(_SPECTRUM / self.weighed_s),
+            _MASS_SPREAD * self.mass,
+        )
+
+
+NO_LOAD = Load()
+"""Before anything is known."""
+
+
+def watch_load(old: Load, vehicle: VehicleState, mass: float, dt: float, *, lifted: float | None) -> Load:
+    """The load after one cycle.
+
+    Args:
+        old: before it.
+        vehicle: newest state, fresh.
+        mass: of the vehicle with its arm, kg.
+        dt: s.
+        lifted: what the rotors surely lift besides the vehicle, kg, so that they may be learnt from; None: not known.
+    """
+    if dt <= 0.0:
+        return old
+    up = -rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))[2]
+    flying = vehicle.armed and not vehicle.landed and up > _UPRIGHT
+    if not (flying and vehicle.thrust > _LEAST_SHARE):  # also where the thrust is nan
+        return replace(interrupted(old), curve=None if old.curve is None else old.curve.forget(dt))
+    new = Flow(up, up * vehicle.thrust, vehicle.velocity_w[2])
+    flow, seen_s, curve = _filtered(old.flow or new, new, dt), old.seen_s + dt, old.curve
+    if seen_s < _SETTLE_S:
+        return replace(old, flow=flow, seen_s=seen_s, now=math.nan)
+    felt = GRAVITY - _POLE * (new.sink - flow.sink)
+    if lifted is not None:
+        curve = (curve or ThrustCurve.prior(flow.push / flow.up)).learn(flow, felt * (1.0 + lifted / mass), dt)
+    elif curve is not None:
+        curve = curve.forget(dt)
+    now = math.nan if curve is None else mass * (curve.lift(flow) / max(felt, 0.3 * GRAVITY) - 1.0)
+    return replace(old, curve=curve, flow=flow, seen_s=seen_s, now=now)
+
+
+def interrupted(old: Load) -> Load:
+    """The load when nothing can be told of this moment."""
+    return replace(old, flow=None, seen_s=0.0, light_s=0.0, now=math.nan)
+
+
+def weigh(old: Load, dt: float) -> Load:
+    """Take the present load into the mean, until that is long enough: later the battery would be weighed too."""
+    if not math.isfinite(old.now) or dt <= 0.0 or old.settled or old.curve is None or old.flow is None:
+        return old
+    total = old.weighed_s + dt
+    mass = old.mass + dt / total * (old.now - old.mass)
+    return replace(old, mass=mass, spread=old.curve.sigma(old.flow), weighed_s=total)
+
+
+def _filtered(old: Flow, new: Flow, dt: float) -> Flow:
+    rotors, body = math.exp(-dt / (1.0 / _POLE + _ROTOR_LAG_S)), math.exp(-_POLE * dt)
+    return Flow(
+        new.up + rotors * (old.up - new.up),
+        new.push + rotors * (old.push - new.push),
+        new.sink + body * (old.sink - new.sink),
+    )
+
+
+def _three(v: Array) -> tuple[float, float, float]:
+    return float(v[0]), float(v[1]), float(v[2])
+
+
+def _rows(P: Array) -> Covariance:
+    return _three(P[0]), _three(P[1]), _three(P[2])

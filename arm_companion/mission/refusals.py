@@ -1,0 +1,25 @@
+"""Why the vehicle cannot set out for a bar or an object now."""
+
+from arm_companion.mission.facts import Bar
+from arm_companion.mission.hazards import hot, low_voltage, vehicle_lost
+from arm_companion.mission.motion import norm, sub
+from arm_companion.mission.situation import Situation
+
+_WITHIN_M = 50.0
+_LEVEL = 0.2  # sine of the steepest axis that an upright vehicle can wrap
+
+
+def cannot_set_out(s: Situation, target: Bar, name: str) -> str | None:
+    """Why the way to `target`, called `name`, cannot begin; None when it can."""
+    vehicle = s.facts.vehicle
+    if (lost := vehicle_lost(s)) is not None:
+        return lost
+    if not vehicle.armed or vehicle.landed:
+        return "the vehicle is not flying"
+    if not s.external:
+        return f"the autopilot is in {vehicle.mode or 'an unknown mode'}: switch it to external set-points first"
+    if (distance := norm(sub(target.point_w, vehicle.position_w))) > _WITHIN_M:
+        return f"the {name} is {distance:.0f} m away; at most {_WITHIN_M:g} m are allowed"
+    if abs(target.axis_w[2]) > _LEVEL:
+        return f"the {name} is not level"
+    return hot(s) or low_voltage(s)

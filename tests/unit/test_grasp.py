@@ -1,0 +1,342 @@
+"""The grasp as a person sees it: what is refused, what a load does to the way on, and who may let go of it."""
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from arm_companion.mission.facts import ArmFault, Commands, Control, Facts, GraspTarget, Order, Result, WrenchSource
+from arm_companion.mission.motion import Reference, norm
+from arm_companion.mission.payload import Flow, Load, ThrustCurve
+from arm_companion.mission.perch import TABLE
+from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.state import CARRYING, Phase, State
+from tests.unit.mission_rig import BENT, PLACE, T0, Run, ask, memory, moved, tendon, vehicle
+
+Hovering = Callable[..., Facts]
+
+
+@pytest.fixture(scope="module", name="parameters")
+def rare(parameters: Parameters) -> Parameters:
+    """The mechanics are asked less often: nothing here looks at them closely."""
+    rates = dataclasses.replace(parameters.config.rates, wrench_hz=1.0)
+    return Parameters(dataclasses.replace(parameters.config, rates=rates), parameters.model)
+
+
+HOVER = 0.5
+MASS = 0.2
+HEIGHT = 0.4
+
+
+def thrust_of(kilograms: float) -> float:
+    """Share of thrust at which the vehicle of `sim.toml` hovers with a load, by the curve that nothing has taught."""
+    return HOVER * (1.0 + kilograms / 1.8 / 1.25)
+
+
+def loaded(facts: Facts, kilograms: float = MASS) -> Facts:
+    return vehicle(thrust=thrust_of(kilograms))(facts)
+
+
+def carrying(phase: Phase, *, up: float = HEIGHT, now: float = MASS, **fields: object) -> State:
+    """Memory of a load that was weighed, `up` m over where it was taken; `now` kg hang on the arm."""
+    x, y, z = PLACE
+    here = (x, y, z - up)
+    load = Load(_known(), _flow(thrust_of(now)), 5.0, now, mass=MASS, spread=0.03, weighed_s=5.0)
+    return memory(phase, **{"position": here, "reference": Reference(here), "load": load, **fields})
+
+
+def _known() -> ThrustCurve:
+    small = ((1e-3, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 1e-3))
+    return dataclasses.replace(ThrustCurve.prior(HOVER), covariance=small)
+
+
+def _flow(share: float) -> Flow:
+    from arm_companion.mission.payload import Flow
+
+    return Flow(1.0, share, 0.0)
+
+
+def aloft(hovering: Hovering, kilograms: float = MASS, up: float = HEIGHT) -> Facts:
+    return loaded(moved((0.0, 0.0, -up))(hovering(BENT)), kilograms)
+
+
+def hovered(phase: Phase, **fields: object) -> State:
+    """Memory of a vehicle whose hover is known."""
+    return memory(phase, load=Load(_known(), _flow(HOVER), 5.0, 0.0), **fields)
+
+
+# --- setting out ---
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (vehicle(armed=False), "not flying"),
+        (vehicle(landed=True), "not flying"),
+        (vehicle(control=Control.PILOT, mode="POSCTL"), "POSCTL"),
+        (vehicle(heartbeat_age_s=9.0), "heartbeat"),
+        (vehicle(position_w=(99.0, 0.0, -2.0)), "object is 96 m away"),
+        (vehicle(thrust=math.nan), "ATTITUDE_TARGET"),
+    ],
+)
+def test_a_grasp_is_refused_with_the_reason(
+    change: Callable[[Facts], Facts], words: str, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(hovered(Phase.READY, control=change(hovering()).vehicle.control), parameters)
+    run.cycle(ask(change(hovering()), Order.GRASP))
+    (answer,) = run.said[-1].answers
+    assert (run.state.phase, answer.result) == (Phase.READY, Result.TEMPORARILY_REJECTED)
+    assert words in answer.reason
+
+
+def test_a_grasp_waits_for_a_hover_to_weigh_by(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(memory(Phase.READY), parameters)
+    run.cycle(ask(hovering(), Order.GRASP))
+    assert "hover for some seconds" in run.said[-1].answers[0].reason
+    run.cycles(hovering(), 4.0)
+    run.cycle(ask(hovering(), Order.GRASP, request=8))
+    assert run.state.phase is Phase.APPROACH
+
+
+def test_an_object_that_stands_upright_is_not_reached_for(parameters: Parameters, hovering: Hovering) -> None:
+    upright = GraspTarget((3.0, 0.0, -1.5), (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0), 0.03)
+    facts = dataclasses.replace(hovering(), grasp_target=upright, grasp_target_age_s=0.1)
+    run = Run(hovered(Phase.READY), parameters)
+    run.cycle(ask(facts, Order.GRASP))
+    assert run.said[-1].answers[0].reason == "the object is not level"
+
+
+def test_the_object_is_the_one_told_last_and_else_the_configured_one(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    state = memory(Phase.REACH, task=Order.GRASP)
+    grasp = parameters.config.grasp
+    assert Situation(state, hovering(), T0, parameters).bar.point_w == grasp.object_position_m
+    turned = GraspTarget((4.0, 1.0, -1.0), (math.cos(0.25), 0.0, 0.0, math.sin(0.25)), 0.02)
+    told = dataclasses.replace(hovering(), grasp_target=turned, grasp_target_age_s=0.1)
+    bar = Situation(state, told, T0, parameters).bar
+    assert (bar.point_w, bar.radius) == ((4.0, 1.0, -1.0), 0.02)
+    assert bar.axis_w == pytest.approx((math.cos(0.5), math.sin(0.5), 0.0))
+    assert Situation(memory(Phase.REACH), told, T0, parameters).bar.point_w == parameters.config.perch.bar_position_m
+
+
+# --- taking ---
+
+
+def test_an_arm_that_closes_around_nothing_goes_back(parameters: Parameters, hovering: Hovering) -> None:
+    wrap = parameters.config.perch.wrap_bend_rad
+    run = Run(memory(Phase.CLOSE, since=T0 - 10.0, bend=(wrap, 0.0), bend_goal=(wrap, 0.0)), parameters)
+    run.cycle(hovering((wrap, 0.0)))
+    assert run.phases == [Phase.CLOSE, Phase.UNLOAD]
+    assert run.state.errors & ArmFault.GRIP_TEST_FAILED
+
+
+def test_the_test_lift_waits_until_the_vehicle_is_steady_then_goes_up(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(hovered(Phase.CLOSE, tension=(30.0, 5.0, 1.0, 5.0), bend=BENT, bend_goal=BENT), parameters)
+    run.cycle(hovering(BENT))
+    assert run.state.phase is Phase.VERIFY
+    run.cycles(hovering(BENT), 2.0)
+    assert run.said[-1].setpoint is not None
+    assert run.said[-1].setpoint.position_w == PLACE
+    run.cycles(hovering(BENT), 2.0)
+    assert run.said[-1].setpoint is not None
+    assert run.said[-1].setpoint.position_w[2] < PLACE[2] - 0.01
+
+
+@pytest.mark.parametrize(
+    ("kilograms", "up", "after", "words"),
+    [
+        (MASS, 0.05, Phase.LIFT, "test lift passed: 0.2"),
+        (0.0, 0.05, Phase.UNLOAD, "0.00 kg on the arm"),
+        (0.9, 0.0, Phase.UNLOAD, "at most 0.5 kg"),
+        (math.nan, 0.05, Phase.UNLOAD, "thrust is not known"),
+    ],
+)
+def test_the_test_lift_tells_an_object_from_nothing_and_from_what_is_too_much(
+    kilograms: float, up: float, after: Phase, words: str, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.VERIFY, up=up, now=kilograms, task=Order.GRASP, since=T0 - 8.0), parameters)
+    run.cycles(aloft(hovering, kilograms, up), 1.5)
+    assert run.phases[1] is after
+    assert any(words in text for text in run.texts)
+
+
+def test_a_load_is_weighed_reported_predicted_and_held_up(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.LIFT), parameters)
+    run.state = dataclasses.replace(run.state, load=dataclasses.replace(run.state.load, mass=0.0, weighed_s=0.0))
+    run.cycles(aloft(hovering), 3.0)
+    said = run.said[-1]
+    assert said.payload is not None
+    assert said.payload.valid
+    assert said.payload.mass == pytest.approx(MASS, rel=0.03)
+    assert 0.0 < said.payload.mass_sigma < 0.05
+    middle = np.array(said.payload.centre_of_mass_b)
+    assert middle == pytest.approx((0.25 / parameters.config.perch.wrap_bend_rad, 0.0, 0.12), abs=1e-6)
+    assert said.wrench.source is WrenchSource.PAYLOAD
+    assert said.wrench.valid
+    arm = parameters.model.free(np.array(run.said[-1].pulls), np.array((0.0, 0.0, 9.80665))).base_wrench[2]
+    assert said.wrench.force_b[2] - arm == pytest.approx(MASS * 9.80665, rel=0.03)
+    assert said.setpoint is not None
+    assert said.setpoint.acceleration_w == pytest.approx((0.0, 0.0, -MASS * 9.80665 / 1.8 / 1.25), rel=0.03)
+
+
+def test_switched_off_nothing_is_held_up(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.CARRY, feedforward=False), parameters)
+    run.cycles(aloft(hovering), 1.0)
+    assert all(said.setpoint is not None and norm(said.setpoint.acceleration_w) == 0.0 for said in run.said)
+
+
+# --- carrying ---
+
+
+def opened(commands: list[Commands]) -> bool:
+    """Whether the arm was let out."""
+    driven = [said.pulls for said in commands if said.pulls is not None]
+    return any(abs(max(after) - max(before)) > 1e-6 for before, after in itertools.pairwise(driven))
+
+
+@pytest.mark.parametrize("phase", sorted(CARRYING, key=lambda p: p.value), ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "change",
+    [
+        vehicle(control=Control.PILOT, mode="POSCTL"),
+        vehicle(control=Control.FAILSAFE, mode="RTL"),
+        vehicle(heartbeat_age_s=9.0),
+        vehicle(position_age_s=2.0),
+        vehicle(armed=False),
+        vehicle(thrust=math.nan),
+        tendon(1, silent=True),
+        tendon(0, error_bits=0x20),
+        tendon(0, temperature=79.0),
+        tendon(2, voltage=9.6),
+        moved((0.0, 1.0, 0.0)),
+        lambda facts: ask(facts, Order.ABORT),
+        lambda facts: ask(facts, Order.STOW),
+        lambda facts: dataclasses.replace(facts, ground_age_s=9.0),
+    ],
+)
+def test_nothing_but_a_person_or_the_ground_lets_go_of_a_load(
+    phase: Phase, change: Callable[[Facts], Facts], parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(phase), parameters)
+    run.cycles(aloft(hovering), 0.1)
+    run.cycles(change(aloft(hovering)), 1.2)
+    assert set(run.phases) <= CARRYING | {Phase.HOLDING}
+    assert not opened(run.said)
+
+
+def test_an_abort_while_setting_down_holds_where_it_is(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.PLACE), parameters)
+    run.cycles(ask(aloft(hovering), Order.ABORT), 1.0)
+    assert run.phases == [Phase.PLACE, Phase.CARRY]
+    assert run.said[-1].setpoint is not None
+    assert run.said[-1].setpoint.velocity_w == (0.0, 0.0, 0.0)
+
+
+def test_after_the_pilot_had_it_the_load_stays_on_until_set_points_are_asked_for_again(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.CARRY), parameters)
+    run.cycles(aloft(hovering), 0.1)
+    flown = vehicle(control=Control.PILOT, mode="POSCTL")(moved((3.0, 0.0, 0.0))(aloft(hovering)))
+    run.cycles(flown, 1.0)
+    back = vehicle(control=Control.EXTERNAL)(flown)
+    run.cycles(back, 0.5)
+    assert run.said[-1].setpoint is None
+    run.cycles(ask(back, Order.READY), 0.5)
+    setpoint = run.said[-1].setpoint
+    assert setpoint is not None
+    assert setpoint.position_w == pytest.approx(flown.vehicle.position_w)
+    assert run.phases == [Phase.CARRY]
+    run.cycles(ask(back, Order.RELEASE, request=9), 1.0)
+    setpoint = run.said[-1].setpoint
+    assert run.state.phase is Phase.PLACE
+    assert setpoint is not None
+    assert setpoint.position_w[0] == pytest.approx(flown.vehicle.position_w[0]), "set down here, not brought back"
+    assert setpoint.position_w[2] > flown.vehicle.position_w[2]
+
+
+def test_a_pilot_who_sets_the_load_down_by_hand_is_followed_by_the_arm(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    pilot = vehicle(control=Control.PILOT, mode="POSCTL")
+    run = Run(carrying(Phase.CARRY, control=Control.PILOT, streaming=False), parameters)
+    run.cycles(ask(pilot(aloft(hovering)), Order.RELEASE), 2.0)
+    assert run.state.phase is Phase.PLACE
+    run.cycles(pilot(aloft(hovering, 0.0, 0.2)), 2.0)
+    assert run.phases == [Phase.CARRY, Phase.PLACE, Phase.RELEASE]
+    assert all(said.setpoint is None for said in run.said)
+
+
+def test_a_load_that_is_lost_is_told_within_three_tenths_of_a_second_and_the_arm_stays_as_it_is(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.CARRY), parameters)
+    run.cycles(aloft(hovering), 1.0)
+    up = MASS * 9.80665 / 1.8  # the thrust stays, the weight is gone
+    for i in range(30):
+        falling = vehicle(velocity_w=(0.0, 0.0, -up * 0.01 * (i + 1)))(aloft(hovering))
+        run.cycle(falling)
+        if run.state.phase is Phase.HOLDING:
+            break
+    assert run.phases == [Phase.CARRY, Phase.HOLDING]
+    assert run.state.errors & ArmFault.CONTACT_LOST
+    assert any("load lost: 0.20 kg" in text for text in run.texts)
+    assert norm(run.state.lean) == 0.0
+
+
+def test_a_load_that_is_lost_before_it_was_weighed_is_lost_too(parameters: Parameters, hovering: Hovering) -> None:
+    state = carrying(Phase.LIFT)
+    run = Run(dataclasses.replace(state, load=dataclasses.replace(state.load, mass=0.0, weighed_s=0.0)), parameters)
+    run.cycles(aloft(hovering), 0.3)
+    assert run.phases == [Phase.LIFT]
+    run.cycles(aloft(hovering, 0.0), 1.0)
+    assert run.phases == [Phase.LIFT, Phase.HOLDING]
+
+
+def test_a_gust_is_not_taken_for_a_lost_load(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.CARRY), parameters)
+    for i in range(200):
+        gust = 0.02 * math.sin(2.0 * math.pi * 0.8 * i * 0.01)  # 0.1 m/s^2 up and down
+        run.cycle(vehicle(velocity_w=(0.0, 0.0, gust))(aloft(hovering)))
+    assert run.phases == [Phase.CARRY]
+
+
+# --- setting down ---
+
+
+def test_the_arm_opens_when_the_load_is_off_at_the_ground(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.PLACE, up=0.0), parameters)
+    run.cycles(aloft(hovering, MASS, 0.0), 1.0)
+    assert run.phases == [Phase.PLACE]
+    run.cycles(aloft(hovering, 0.0, 0.0), 2.0)
+    assert run.phases == [Phase.PLACE, Phase.RELEASE]
+    assert any("the load is off" in text for text in run.texts)
+
+
+def test_with_nothing_below_the_load_is_kept(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(carrying(Phase.PLACE, up=0.0), parameters)
+    for i in range(800):
+        run.cycle(aloft(hovering, MASS, -0.06 * min(i / 400.0, 1.0)))
+    assert run.phases[:2] == [Phase.PLACE, Phase.CARRY]
+    assert run.state.errors & ArmFault.NO_CONTACT
+    assert not opened(run.said)
+
+
+def test_without_a_thrust_it_is_set_down_at_the_height_of_the_pick_up(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.PLACE, up=0.0), parameters)
+    run.cycles(vehicle(thrust=math.nan)(aloft(hovering, MASS, 0.0)), 4.0)
+    assert run.phases == [Phase.PLACE, Phase.RELEASE]
+
+
+def test_the_way_out_begins_where_the_arm_is() -> None:
+    for phase in CARRYING:
+        row = TABLE.order(Order.RELEASE, phase)
+        assert row is None or row.target is Phase.PLACE, "a carried load is never opened on the spot by RELEASE"
