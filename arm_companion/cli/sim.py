@@ -11,9 +11,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from arm_companion.cli import sitl
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.config import Config
-from arm_companion.errors import ArmError
+from arm_companion.errors import ArmError, ConfigError
 
 _SCENARIOS = ("perch", "world")
 
@@ -53,6 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--log", type=Path, metavar="FILE", help="write the daemon's record here (default: DIR/record.mcap)"
     )
+    sitl.add_arguments(parser)
 
 
 def _count(text: str) -> int:
@@ -72,12 +74,15 @@ def run(arguments: argparse.Namespace) -> int:
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
             return 2
+    sitl.check(arguments)
     if arguments.seed is not None:
         arguments.settings.append(f"sim.seed={arguments.seed}")
     config = load_from(arguments)
     if arguments.trials is not None:
         return _trials(arguments, config)
     arguments.output.mkdir(parents=True, exist_ok=True)
+    if arguments.sitl_connect:
+        return sitl.check_running(arguments)
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
 
 
@@ -109,10 +114,12 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     output: Path = arguments.output
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
+    fly = _simulated if arguments.simulated else _real_time
     try:
-        result = (
-            _simulated(arguments, config, progress) if arguments.simulated else _real_time(arguments, config, progress)
-        )
+        with sitl.flying(arguments, config) as stack:
+            result = fly(arguments, config, progress, stack)
+    except ConfigError:
+        raise
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
@@ -172,20 +179,20 @@ def _record_path(arguments: argparse.Namespace) -> Path:
     return path
 
 
-def _simulated(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, stack: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments)))
+    return run_simulated(fly_simulated(config, progress.say, log=_record_path(arguments), flown_by=stack))
 
 
-def _real_time(arguments: argparse.Namespace, config: Config, progress: Any) -> Any:
+def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, stack: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     words = _daemon_words(arguments)
     with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say))
+        return runner.run(fly_real_time(config, words, arguments.output / "daemon.log", progress.say, flown_by=stack))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:

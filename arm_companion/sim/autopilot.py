@@ -51,6 +51,9 @@ class AutopilotStandIn:
         KeyError: for another flavour.
     """
 
+    period_s = 0.004
+    """250 Hz, as PX4 and ArduPilot run their attitude loops and more often than servos answer."""
+
     def __init__(self, config: Config, flavour: str = "px4", *, ready_s: float | None = None) -> None:
         self._flavour = FLAVOURS[flavour]
         self._config = config
@@ -87,6 +90,10 @@ class AutopilotStandIn:
         }
 
     # What the world sees --------------------
+
+    def due(self) -> bool:
+        """It keeps nobody waiting."""
+        return True
 
     def control(self, state: RigidState, dt: float) -> RotorCommand:
         """One step of estimator and controller; call at 250 Hz or more.
