@@ -90,12 +90,13 @@ class Px4Bridge:
         Args:
             within_s: s on the machine's clock, 0 to look only.
         """
-        if self._connection is not None and not self._lockstep:
-            within_s = min(within_s, _BOOTING_PERIOD_S)
-        until = time.perf_counter() + within_s
+        start = time.perf_counter()
+        until = start + within_s
         while True:
             self._accept()
             self._read()
+            if self._connection is not None and not self._lockstep:
+                until = min(until, start + _BOOTING_PERIOD_S)
             if self._connection is not None and self._lockstep and not self._waiting:
                 return True
             left = until - time.perf_counter()
