@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from arm_companion.cli import sim
+from arm_companion.cli import sim as command
 from arm_companion.cli import sitl as options
 from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
@@ -88,8 +88,12 @@ def config() -> Config:
     companion, ground = (one.getsockname()[1] for one in held)
     for one in held:
         one.close()
-    urls = {"autopilot_url": f"udpout:127.0.0.1:{companion}", "operator_autopilot_url": f"udpin:127.0.0.1:{ground}"}
-    return replace(plain, sim=replace(plain.sim, **urls))
+    sim = replace(
+        plain.sim,
+        autopilot_url=f"udpout:127.0.0.1:{companion}",
+        operator_autopilot_url=f"udpin:127.0.0.1:{ground}",
+    )
+    return replace(plain, sim=sim)
 
 
 @pytest.fixture(autouse=True)
@@ -256,7 +260,7 @@ def test_a_relay_says_which_port_is_taken() -> None:
 
 def arguments(words: list[str]) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    sim.add_arguments(parser)
+    command.add_arguments(parser)
     return parser.parse_args(["perch", *words])
 
 
