@@ -16,6 +16,7 @@ from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.ardupilot_control import ArdupilotController
 from arm_companion.sim.autopilot_commands import Commands
 from arm_companion.sim.autopilot_flavours import FLAVOURS, FORWARD, LINK_OPTIONS, TAKEOFF_ALTITUDE, Mode
 from arm_companion.sim.autopilot_modes import FlightModes
@@ -62,7 +63,8 @@ class AutopilotStandIn:
         mass = config.vehicle.mass_kg
         north, east, down = (mass * radius**2 for radius in _GYRATION_M)
         scale = 1.0 + self._rng.uniform(-_HOVER_THRUST_ERROR, _HOVER_THRUST_ERROR)
-        self._controller = FlightController(Airframe(mass, (north, east, down), scale))
+        controller = FlightController if self._flavour.is_px4 else ArdupilotController
+        self._controller = controller(Airframe(mass, (north, east, down), scale))
         self._estimator = Estimator(self._rng, config.sim.position_noise_m)
         self._battery = Battery()
         defaults = dict(self._flavour.parameters)
