@@ -2,8 +2,8 @@
 
 ArduPilot takes the acceleration of a set-point for that of a path which the vehicle shall fly, not for a force: held
 for long at a position that stays, it moves the path's end away by half a metre for each m/s^2, or without end
-(`AC_PosControl::input_pos_vel_accel_NE`, and what `tests/sitl` sees). What its controller makes of a path e(t) beside the
-commanded place, with the vehicle at that place, is the acceleration
+(`AC_PosControl::input_pos_vel_accel_NE`; docs/adr/0025). What its controller makes of a path e(t) beside the commanded
+place, with the vehicle at that place, is the acceleration
 
     e'' + (P + I/s + D s) (s + K) e
 

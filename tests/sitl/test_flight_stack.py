@@ -3,15 +3,19 @@
 import asyncio
 import json
 import math
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from arm_companion.clock import run_simulated
+from arm_companion.clock import run_simulated, ticks
 from arm_companion.config import load
+from arm_companion.drivers.path_feedforward import PathFeedforward
+from arm_companion.mission.facts import Setpoint, Vec3
 from arm_companion.protocol.dialect import mav
 from arm_companion.sim import sitl
+from arm_companion.sim.flight_control import ZERO
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.sitl_check import Check, Findings
 from arm_companion.sim.verdict import judge
@@ -51,6 +55,96 @@ def test_a_perch_from_take_off_to_landing(stack: str, tmp_path: Path) -> None:
         result = run_simulated(fly_simulated(config, print, log=tmp_path / "record.mcap", flown_by=running))
     verdict = judge(result.flight, result.failure)
     assert verdict.success, verdict.reason
+
+
+def test_a_force_on_the_vehicle_is_held_against(stack: str, tmp_path: Path) -> None:
+    """2 N, as the arm would pull, on the plant; set-points without it, with it as an acceleration, and as the daemon's."""
+    push = 2.0
+
+    async def look(rig: Rig) -> dict[str, dict[str, float]]:
+        await take_off(rig)
+        lean = (-push / rig.config.vehicle.mass_kg, 0.0, 0.0)
+        own = PathFeedforward().shaped if stack == "ardupilot" else as_it_is
+        found = {}
+        for name, wanted, shape in (("none", ZERO, as_it_is), ("acceleration", lean, as_it_is), ("daemon", lean, own)):
+            found[name] = await pushed(rig, push, wanted, shape)
+        await land(rig)
+        return found
+
+    found = fly(stack, tmp_path / "log", look, daemon=False)
+    print(json.dumps({"stack": stack, "push_n": push, **found}))
+    assert found["daemon"]["most_m"] < 0.5 * found["none"]["most_m"]
+    assert found["daemon"]["end_m"] < 0.1
+    if stack == "ardupilot":
+        assert found["acceleration"]["end_m"] > 0.3, "it takes an acceleration for a path: docs/adr/0025"
+
+
+def as_it_is(setpoint: Setpoint, _now: float) -> Setpoint:
+    return setpoint
+
+
+async def pushed(
+    rig: Rig, push: float, lean: Vec3, shape: Callable[[Setpoint, float], Setpoint], seconds: float = 10.0
+) -> dict[str, float]:
+    """How far the vehicle is from where it was while it is pushed north; it is let go and waited for after that."""
+    place = rig.ground.latest("LOCAL_POSITION_NED")
+    hold = (place.x, place.y, place.z)  # type: ignore[union-attr]  # it flies
+    x0 = rig.world.plant.state().position_w[0]
+    away = []
+    async for i, now in clockwork(rig, seconds):
+        share = min(i * 0.01 / 0.3, 1.0)
+        rig.world.plant.push((push * share, 0.0, 0.0))
+        wanted: Vec3 = (lean[0] * share, lean[1] * share, lean[2] * share)
+        send(rig, shape(Setpoint(hold, ZERO, wanted, 0.0), now))
+        away.append(rig.world.plant.state().position_w[0] - x0)
+    rig.world.plant.push(ZERO)
+    async for _, now in clockwork(rig, 12.0):
+        send(rig, shape(Setpoint(hold, ZERO, ZERO, 0.0), now))
+    return {"most_m": max(map(abs, away)), "end_m": abs(away[-1])}
+
+
+async def clockwork(rig: Rig, seconds: float) -> AsyncIterator[tuple[int, float]]:
+    """Number and time of the daemon's cycles."""
+    i = 0
+    async for tick in ticks(1.0 / rig.config.vehicle.state_rate_hz):
+        if i * 0.01 >= seconds:
+            return
+        yield i, tick.now
+        i += 1
+
+
+def send(rig: Rig, setpoint: Setpoint) -> None:
+    numbers = (*setpoint.position_w, *setpoint.velocity_w, *setpoint.acceleration_w, setpoint.yaw, 0.0)
+    mask = mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
+    rig.ground.send(mav.MAVLink_set_position_target_local_ned_message(0, *AUTOPILOT, 1, mask, *numbers))
+
+
+async def take_off(rig: Rig) -> None:
+    """In the air, under external control, with a stream of set-points behind it."""
+    await rig.until(lambda: rig.ground.latest("HEARTBEAT") is not None, 60.0, "no heartbeat")
+    interval = [float(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED), 20_000.0]
+    await rig.order(mav.MAV_CMD_SET_MESSAGE_INTERVAL, *interval)
+    if rig.stack == "ardupilot":
+        await rig.order(mav.MAV_CMD_DO_SET_MODE, 1.0, float(GUIDED))
+    await rig.arm_when_ready()
+    nan = math.nan
+    await rig.order(mav.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, nan, nan, nan, rig.config.sim.takeoff_height_m)
+    await rig.until(lambda: rig.height() > 0.8 * rig.config.sim.takeoff_height_m, 40.0, "it does not climb")
+    await asyncio.sleep(5.0)
+    place = rig.ground.latest("LOCAL_POSITION_NED")
+    hold = (place.x, place.y, place.z)  # type: ignore[union-attr]  # it flies
+    async for i, _ in clockwork(rig, 8.0):
+        send(rig, Setpoint(hold, ZERO, ZERO, 0.0))
+        if i == 150 and rig.stack == "px4":
+            mode = mav.MAVLink_command_long_message(*AUTOPILOT, mav.MAV_CMD_DO_SET_MODE, 0, 1.0, 6.0, *[0.0] * 5)
+            rig.ground.send(mode)
+    assert rig.external()
+
+
+async def land(rig: Rig) -> None:
+    nan = math.nan
+    await rig.order(mav.MAV_CMD_NAV_LAND, 0.0, 0.0, 0.0, nan, nan, nan, 0.0)
+    await rig.until(lambda: not _armed(rig), 60.0, "it does not land")
 
 
 def test_traffic_to_the_ground_passes_the_autopilot_all_three_ways(stack: str, tmp_path: Path) -> None:
@@ -120,8 +214,7 @@ def test_external_control_stays_until_the_pilot_takes_it_or_the_autopilot_boots(
         await rig.until(lambda: not rig.external(), 5.0, "the pilot does not get it")
         await asyncio.sleep(5.0)
         assert not rig.external(), "the daemon takes control back from the pilot"
-        await rig.order(mav.MAV_CMD_NAV_LAND, 0.0, 0.0, 0.0, nan, nan, nan, 0.0)
-        await rig.until(lambda: not _armed(rig), 60.0, "it does not land")
+        await land(rig)
         # the autopilot boots again
         before = len(rig.companion.times("HEARTBEAT", AUTOPILOT))
         assert await rig.order(mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, 1.0) == mav.MAV_RESULT_ACCEPTED

@@ -11,7 +11,7 @@ from arm_companion.mission.facts import Setpoint, Vec3
 
 PLACE, STILL = (1.0, 2.0, -3.0), (0.0, 0.0, 0.0)
 DT = 0.01
-P, I, D, K = 2.0, 1.0, 0.25, 1.0  # ArduPilot's defaults, level
+P, INTEGRAL, D, K = 2.0, 1.0, 0.25, 1.0  # ArduPilot's defaults, level
 P_DOWN, K_DOWN, P_A, I_A = 5.0, 1.0, 0.98, 1.96
 
 
@@ -41,7 +41,7 @@ def test_the_controller_makes_of_the_path_what_was_asked(waves: list[tuple[float
         v = [out.velocity_w[0] - 0.1, out.velocity_w[1], out.velocity_w[2]]
         a = out.acceleration_w
         level += (v[0] + K * e[0]) * DT
-        made = a[0] + P * (v[0] + K * e[0]) + I * level + D * (a[0] + K * v[0])
+        made = a[0] + P * (v[0] + K * e[0]) + INTEGRAL * level + D * (a[0] + K * v[0])
         assert made == pytest.approx(lean[0], abs=0.05)
         wanted = a[2] + P_DOWN * (v[2] + K_DOWN * e[2])
         down += wanted * DT
