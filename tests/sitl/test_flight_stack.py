@@ -58,7 +58,7 @@ def test_a_perch_from_take_off_to_landing(stack: str, tmp_path: Path) -> None:
 
 
 def test_a_force_on_the_vehicle_is_held_against(stack: str, tmp_path: Path) -> None:
-    """2 N, as the arm would pull, on the plant; set-points without it, with it as an acceleration, and as the daemon's."""
+    """2 N on the plant; set-points without a word of it, with it as an acceleration, and as the daemon tells it."""
     push = 2.0
 
     async def look(rig: Rig) -> dict[str, dict[str, float]]:

@@ -35,7 +35,8 @@ def test_the_controller_makes_of_the_path_what_was_asked(waves: list[tuple[float
     level, down = 0.0, 0.0  # integrals
     for i in range(400):
         t = i * DT
-        lean: Vec3 = tuple(a * math.sin(rate * t) + b * (1.0 - math.exp(-t)) for a, b in waves)
+        x, y, z = (a * math.sin(rate * t) + b * (1.0 - math.exp(-t)) for a, b in waves)
+        lean = (x, y, z)
         out = path.shaped(asked(lean), t)
         e = [out.position_w[k] - PLACE[k] for k in range(3)]
         v = [out.velocity_w[0] - 0.1, out.velocity_w[1], out.velocity_w[2]]
