@@ -169,8 +169,6 @@ class Check:
         loop = asyncio.get_running_loop()
         start = loop.time()
         self._say("arming")
-        if self._stack == "ardupilot":
-            await self._take_external_control()
         while True:
             result = await self._link.command(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0, 0.0], timeout=5.0)
             if result == mav.MAV_RESULT_ACCEPTED:
@@ -180,6 +178,8 @@ class Check:
                 raise CheckFailed(f"arming: {mav.enums['MAV_RESULT'][result].name} {why}".strip())
             await asyncio.sleep(1.0)
         self.findings.ready_s = loop.time() - start
+        if self._stack == "ardupilot":  # armed first: until then its radio's mode switch has the last word
+            await self._take_external_control()
         height = _HEIGHT_M
         if self._stack == "px4":  # a height over the sea, from where it stands
             place = self._link.latest("GLOBAL_POSITION_INT")

@@ -124,11 +124,8 @@ async def take_off(rig: Rig) -> None:
     await rig.until(lambda: rig.ground.latest("HEARTBEAT") is not None, 60.0, "no heartbeat")
     interval = [float(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED), 20_000.0]
     await rig.order(mav.MAV_CMD_SET_MESSAGE_INTERVAL, *interval)
-    if rig.stack == "ardupilot":
-        await rig.order(mav.MAV_CMD_DO_SET_MODE, 1.0, float(GUIDED))
     await rig.arm_when_ready()
-    nan = math.nan
-    await rig.order(mav.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, nan, nan, nan, rig.config.sim.takeoff_height_m)
+    await climb(rig)
     await rig.until(lambda: rig.height() > 0.8 * rig.config.sim.takeoff_height_m, 40.0, "it does not climb")
     await asyncio.sleep(5.0)
     place = rig.ground.latest("LOCAL_POSITION_NED")
@@ -139,6 +136,15 @@ async def take_off(rig: Rig) -> None:
             mode = mav.MAVLink_command_long_message(*AUTOPILOT, mav.MAV_CMD_DO_SET_MODE, 0, 1.0, 6.0, *[0.0] * 5)
             rig.ground.send(mode)
     assert rig.external()
+
+
+async def climb(rig: Rig) -> None:
+    """ArduPilot is put into GUIDED when it is armed: before, its radio's switch has the last word."""
+    if rig.stack == "ardupilot":
+        assert await rig.order(mav.MAV_CMD_DO_SET_MODE, 1.0, float(GUIDED)) == mav.MAV_RESULT_ACCEPTED
+    height = rig.config.sim.takeoff_height_m
+    where = (math.nan, math.nan, math.nan, height)
+    assert await rig.order(mav.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, *where) == mav.MAV_RESULT_ACCEPTED
 
 
 async def land(rig: Rig) -> None:
@@ -190,11 +196,8 @@ def test_external_control_stays_until_the_pilot_takes_it_or_the_autopilot_boots(
         await rig.until(lambda: rig.ground.latest("HEARTBEAT", ARM) is not None, 60.0, "the arm is not heard")
         await rig.until(lambda: _phase(rig) == "STOWED", 30.0, "the arm does not find itself stowed")
         assert await rig.order(mav.MAV_CMD_ARM_READY, target=ARM) == mav.MAV_RESULT_ACCEPTED
-        if stack == "ardupilot":
-            await rig.order(mav.MAV_CMD_DO_SET_MODE, 1.0, float(GUIDED))
         figures["ready_s"] = await rig.arm_when_ready()
-        nan = math.nan
-        await rig.order(mav.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, nan, nan, nan, rig.config.sim.takeoff_height_m)
+        await climb(rig)
         await rig.until(lambda: rig.height() > 0.8 * rig.config.sim.takeoff_height_m, 40.0, "it does not climb")
         await asyncio.sleep(4.0)
         if stack == "px4":
