@@ -24,7 +24,7 @@ from typing import Final
 
 from arm_companion.mission.facts import Setpoint, Vec3
 
-# ArduPilot copter's defaults: PSC_NE_VEL_P 2, _I 1, _D 0.25, PSC_NE_POS_P 1; PSC_D_VEL_P 5, PSC_D_POS_P 1; PSC_D_ACC_P
+# ArduPilot copter's defaults: PSC_VELXY_P 2, _I 1, _D 0.25, PSC_POSXY_P 1; PSC_VELZ_P 5, PSC_POSZ_P 1; PSC_ACCZ_P
 # and _I at half throttle in hover.
 _P, _I, _D, _K = 2.0, 1.0, 0.25, 1.0
 _LEVEL: Final = (1.0 + _D, _P + _D * _K, _I + _P * _K, _I * _K)

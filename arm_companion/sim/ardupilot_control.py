@@ -28,11 +28,11 @@ class AxisGains:
     """Gains of one axis; beside each the parameter for north and east.
 
     Attributes:
-        position: 1/s, PSC_NE_POS_P.
-        velocity, integral, derivative: 1/s, 1/s^2 and 1, PSC_NE_VEL_P, _I and _D.
+        position: 1/s, PSC_POSXY_P.
+        velocity, integral, derivative: 1/s, 1/s^2 and 1, PSC_VELXY_P, _I and _D.
         accelerate: m/s^2, how hard the path is bent, WPNAV_ACCEL.
         speed: m/s, how fast a position error is closed, WPNAV_SPEED.
-        jerk: m/s^3, PSC_JERK_NE.
+        jerk: m/s^3, PSC_JERK_XY.
     """
 
     position: float = 1.0
@@ -46,10 +46,10 @@ class AxisGains:
 
 LEVEL = AxisGains()
 DOWN = AxisGains(position=1.0, velocity=5.0, integral=0.0, derivative=0.0, accelerate=1.0, speed=1.5)
-_ERROR_CUTOFF_HZ = 5.0  # PSC_NE_VEL_FLTE and _FLTD
-_THRUST_PER_ACCELERATION = 0.1  # PSC_D_ACC_P over the hover throttle of 0.5: share of hover thrust for 1 m/s^2
-_THRUST_INTEGRAL = 0.2  # 1/s, PSC_D_ACC_I over the same
-_ACCELERATION_CUTOFF_HZ = 20.0  # PSC_D_ACC_FLTE
+_ERROR_CUTOFF_HZ = 5.0  # PSC_VELXY_FLTE and _FLTD
+_THRUST_PER_ACCELERATION = 0.1  # PSC_ACCZ_P over the hover throttle of 0.5: share of hover thrust for 1 m/s^2
+_THRUST_INTEGRAL = 0.2  # 1/s, PSC_ACCZ_I over the same
+_ACCELERATION_CUTOFF_HZ = 20.0  # PSC_ACCZ_FLTE
 
 
 @dataclass(slots=True)
