@@ -234,8 +234,9 @@ class Check:
                 await asyncio.gather(task, return_exceptions=True)
 
     async def _command(self, command: int, parameters: list[float], what: str) -> None:
+        whole = [*parameters, *[0.0] * (7 - len(parameters))]  # ArduPilot denies an interval with what is not a number
         try:
-            result = await self._link.command(command, parameters, timeout=5.0)
+            result = await self._link.command(command, whole, timeout=5.0)
         except TimeoutError as error:
             raise CheckFailed(f"{what}: {error}") from None
         if result != mav.MAV_RESULT_ACCEPTED:
