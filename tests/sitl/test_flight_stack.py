@@ -44,7 +44,7 @@ def test_it_connects_tells_its_state_and_flies_set_points(stack: str, tmp_path: 
     mode, drift = found.after_loss
     if stack == "ardupilot":
         assert mode == GUIDED, "it brakes after GUID_TIMEOUT and stays in GUIDED"
-        assert drift < 4.0
+        assert 3.0 < drift < 20.0, "until then it flies on with the last velocity and acceleration"
     else:
         assert (mode >> 16) & 0xFF != 6, "it leaves OFFBOARD by COM_OBL_RC_ACT"
 
