@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: help setup demo test scenarios soak check bench docs deb format clean
+.PHONY: help setup demo test scenarios sitl soak check bench docs deb format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -24,11 +24,16 @@ demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated 
 	@$(BIN)/arm-companion sim perch --output build/demo
 
 test: $(STAMP)  ## run the tests: what has its own time on all cores, then what runs against the wall clock alone
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak'
-	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak'
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak and not sitl'
+	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak and not sitl'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and install the Debian package
 	@$(BIN)/python -m pytest -n auto --dist load -m scenario
+
+sitl: $(STAMP)  ## fly the real flight stacks that ARM_COMPANION_ARDUPILOT_SITL and ARM_COMPANION_PX4_SITL name
+	@test -n "$$ARM_COMPANION_ARDUPILOT_SITL$$ARM_COMPANION_PX4_SITL" || \
+		{ echo "name your own SITL program first: see tests/sitl/README.md" >&2; exit 2; }
+	@$(BIN)/python -m pytest -m sitl -s tests/sitl
 
 soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questions to the mechanics: none may go wrong
 	@$(BIN)/python -m pytest -m soak

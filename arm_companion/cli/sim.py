@@ -11,9 +11,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+from arm_companion.cli import sitl
 from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
 from arm_companion.config import Config
-from arm_companion.errors import ArmError
+from arm_companion.errors import ArmError, ConfigError
 
 _CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "grasp": "sim_grasp.toml", "world": "sim.toml"}
 _FILMS = (".mp4", ".mkv", ".webm", ".gif")
@@ -64,6 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--log", type=Path, metavar="FILE", help="write the daemon's record here (default: DIR/record.mcap)"
     )
+    sitl.add_arguments(parser)
 
 
 def _count(text: str) -> int:
@@ -90,12 +92,15 @@ def run(arguments: argparse.Namespace) -> int:
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion sim needs '{name}': pip install 'arm-companion[sim]'", file=sys.stderr)
             return 2
+    sitl.check(arguments)
     if arguments.seed is not None:
         arguments.settings.append(f"sim.seed={arguments.seed}")
     config = load_from(arguments)
     if arguments.trials is not None:
         return _trials(arguments, config)
     arguments.output.mkdir(parents=True, exist_ok=True)
+    if arguments.sitl_connect:
+        return sitl.check_running(arguments)
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
 
 
@@ -138,6 +143,7 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     output: Path = arguments.output
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
+    fly = _simulated if arguments.simulated else _real_time
     try:
         studio = None if arguments.video is None else film.studio()
     except film.NoFilm as error:
@@ -148,8 +154,10 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
         world.pose_every_s = None if studio is None else 1.0 / film.PICTURES_PER_S
 
     try:
-        fly = _simulated if arguments.simulated else _real_time
-        result = fly(arguments, config, progress, prepare)
+        with sitl.flying(arguments, config) as stack:
+            result = fly(arguments, config, progress, prepare, stack)
+    except ConfigError:
+        raise
     except (ArmError, OSError) as error:
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return 1
@@ -234,16 +242,16 @@ def _record_path(arguments: argparse.Namespace) -> Path:
     return path
 
 
-def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
+def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
-    fly = SCENARIOS[arguments.scenario].fly
-    return run_simulated(fly_simulated(config, progress.say, prepare, _record_path(arguments), fly=fly))
+    script, log = SCENARIOS[arguments.scenario].fly, _record_path(arguments)
+    return run_simulated(fly_simulated(config, progress.say, prepare, log, fly=script, flown_by=stack))
 
 
-def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any) -> Any:
+def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
@@ -251,7 +259,7 @@ def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, pre
     words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         log = arguments.output / "daemon.log"
-        return runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly))
+        return runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly, flown_by=stack))
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:

@@ -15,6 +15,7 @@ from arm_companion.drivers.flight_stack import (
     mode_name,
 )
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.drivers.path_feedforward import PathFeedforward
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.errors import ProtocolError
 from arm_companion.mission.facts import Control, Quaternion, Setpoint, Vec3, VehicleState
@@ -100,6 +101,7 @@ class Autopilot:
         self._boot_ms: dict[int, int] = {}
         self._check_now = asyncio.Event()
         self._mismatch_told = False
+        self._path = PathFeedforward() if vehicle.autopilot == "ardupilot" else None
         self._reset()
         link.subscribe(self._on_message, (HEARTBEAT, ATTITUDE, POSITION, THRUST, LANDED, THROTTLE, ACK))
 
@@ -163,6 +165,10 @@ class Autopilot:
         if self._heartbeat is None:
             self.counters.setpoints_unsent += 1
             return
+        if self._path is not None:
+            if control_of(self._heartbeat, self._config.autopilot) is not Control.EXTERNAL:
+                self._path.reset()
+            setpoint = self._path.shaped(setpoint, now)
         stamp = None if self._timesync is None else self._timesync.autopilot_time(now)
         message = mav.MAVLink_set_position_target_local_ned_message(
             int((now if stamp is None else max(stamp, 0.0)) * 1e3) & 0xFFFFFFFF,

@@ -16,6 +16,7 @@ from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.ardupilot_control import ArdupilotController
 from arm_companion.sim.autopilot_commands import Commands
 from arm_companion.sim.autopilot_flavours import FLAVOURS, FORWARD, LINK_OPTIONS, TAKEOFF_ALTITUDE, Mode
 from arm_companion.sim.autopilot_modes import FlightModes
@@ -51,6 +52,9 @@ class AutopilotStandIn:
         KeyError: for another flavour.
     """
 
+    period_s = 0.004
+    """250 Hz, as PX4 and ArduPilot run their attitude loops and more often than servos answer."""
+
     def __init__(self, config: Config, flavour: str = "px4", *, ready_s: float | None = None) -> None:
         self._flavour = FLAVOURS[flavour]
         self._config = config
@@ -60,7 +64,7 @@ class AutopilotStandIn:
         north, east, down = (mass * radius**2 for radius in _GYRATION_M)
         scale = 1.0 + self._rng.uniform(-_HOVER_THRUST_ERROR, _HOVER_THRUST_ERROR)
         frame = Airframe(mass, (north, east, down), scale, thrust_curve=config.sim.thrust_curve)
-        self._controller = FlightController(frame)
+        self._controller = (FlightController if self._flavour.is_px4 else ArdupilotController)(frame)
         self._estimator = Estimator(self._rng, config.sim.position_noise_m)
         self._battery = Battery()
         defaults = dict(self._flavour.parameters)
@@ -88,6 +92,10 @@ class AutopilotStandIn:
         }
 
     # What the world sees --------------------
+
+    def due(self) -> bool:
+        """It keeps nobody waiting."""
+        return True
 
     def control(self, state: RigidState, dt: float) -> RotorCommand:
         """One step of estimator and controller; call at 250 Hz or more.

@@ -25,7 +25,7 @@ from arm_companion.sim.operator_link import OperatorLink
 from arm_companion.sim.plant import Pose
 from arm_companion.sim.scenario import Operator, Say
 from arm_companion.sim.servo_emulator import EmulatedBus
-from arm_companion.sim.world import World
+from arm_companion.sim.world import FlightStack, World
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.base import Opener
 from arm_companion.transport.memory import MemoryPipe
@@ -60,6 +60,7 @@ async def fly_simulated(
     *,
     world: Config | None = None,
     fly: Script = Operator.fly_perch,
+    flown_by: FlightStack | None = None,
 ) -> Result:
     """One flight on the running simulated loop: every part in this process, over in-memory pipes.
 
@@ -70,9 +71,10 @@ async def fly_simulated(
         log: where the daemon's record goes.
         world: how the world is, where it differs from what the daemon believes.
         fly: the operator's script.
+        flown_by: a flight stack in place of the stand-in.
     """
     companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
-    plant = World(config if world is None else world)
+    plant = World(config if world is None else world, flown_by)
     prepare(plant)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
     memory = MemoryRecorder()
@@ -91,7 +93,7 @@ async def fly_simulated(
     stop = asyncio.Event()
     async with _running(
         plant.run,
-        lambda: plant.autopilot.run(companion.opener(0), ground.opener(0)),
+        lambda: plant.flown_by.run(companion.opener(0), ground.opener(0)),
         lambda: bus.serve_memory(servos.opener(0)),
         lambda: daemon.run(stop),
         link.run,
@@ -119,6 +121,7 @@ async def fly_real_time(
     prepare: Prepare = lambda _: None,
     *,
     fly: Script = Operator.fly_perch,
+    flown_by: FlightStack | None = None,
 ) -> Result:
     """One flight in real time: UDP, a pty, and the daemon as in flight, in a process of its own.
 
@@ -129,8 +132,9 @@ async def fly_real_time(
         say: told what happens.
         prepare: changes the world before the flight.
         fly: the operator's script.
+        flown_by: a flight stack in place of the stand-in.
     """
-    world = World(config)
+    world = World(config, flown_by)
     prepare(world)
     flight = Flight(samples=world.samples)
     sim = config.sim
@@ -180,7 +184,7 @@ async def _in_real_time(world: World, config: Config) -> AsyncIterator[None]:
     ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
     async with _running(
         world.run,
-        lambda: world.autopilot.run(open_url(sim.autopilot_url), ground),
+        lambda: world.flown_by.run(open_url(sim.autopilot_url), ground),
         lambda: bus.serve_pty(config.servos.port),
     ):
         await bus.wait_ready()

@@ -8,6 +8,7 @@ import asyncio
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
@@ -15,13 +16,13 @@ from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.sim.autopilot import AutopilotStandIn
 from arm_companion.sim.plant import Plant, Pose
-from arm_companion.sim.ports import PlantTruth, RigidState, Vec3
+from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
 from arm_companion.sim.servo_emulator import ServoEmulator
+from arm_companion.transport.base import Opener
 
-_CONTROL_PERIOD_S = 0.004  # 250 Hz, as PX4 and ArduPilot run their attitude loops and more often than servos answer
-_SAMPLE_EVERY = 10  # control periods
+_SAMPLE_PERIOD_S = 0.04
 _MOST_BEHIND_S = 0.1
-_PERIODS_IN_ONE_GO = 2
+_IN_ONE_GO_S = 0.008
 _TICKS_PER_RAD = 4096 / (2.0 * math.pi)
 
 
@@ -35,13 +36,42 @@ class Sample:
     asked_w: Vec3 | None = None  # position that the autopilot flies to; None: none, or not in all axes
 
 
-class World:
-    """Plant, autopilot stand-in and servo emulator, stepped together."""
+class FlightStack(Protocol):
+    """Who flies the vehicle: the stand-in, or a real flight stack behind a bridge.
 
-    def __init__(self, config: Config) -> None:
+    Attributes:
+        period_s: s between two looks at the vehicle.
+    """
+
+    period_s: float
+
+    @property
+    def asked_w(self) -> Vec3 | None:
+        """Position that it flies to, m, world axes; None: none, not in all axes, or not known."""
+
+    def due(self) -> bool:
+        """Whether the world may go on; False while a flight stack in lock-step has not had its turn."""
+
+    def control(self, state: RigidState, dt: float) -> RotorCommand:
+        """What the rotors exert until the next call, `dt` seconds later."""
+
+    async def run(self, companion: Opener, ground: Opener) -> None:
+        """Serve the ports to the companion and to the ground until cancelled."""
+
+
+class World:
+    """Plant, flight stack and servo emulator, stepped together.
+
+    Args:
+        config: of the world.
+        flown_by: a flight stack in place of the stand-in.
+    """
+
+    def __init__(self, config: Config, flown_by: FlightStack | None = None) -> None:
         self._config = config
         self.plant = Plant(config)
-        self.autopilot = AutopilotStandIn(config, config.vehicle.autopilot)
+        self.flown_by: FlightStack = flown_by or AutopilotStandIn(config, config.vehicle.autopilot)
+        self._period_s = self.flown_by.period_s
         self.servos = ServoEmulator(config.servos, config.sim.seed)
         self.samples: list[Sample] = []
         self.events: list[tuple[float, Callable[[World], None]]] = []
@@ -49,6 +79,17 @@ class World:
         self.pose_every_s: float | None = None
         """How often a pose is kept, for a film; None: never."""
         self.lost_s = 0.0  # real time that the physics could not keep up with
+
+    @property
+    def autopilot(self) -> AutopilotStandIn:
+        """The stand-in.
+
+        Raises:
+            TypeError: a real flight stack flies.
+        """
+        if not isinstance(self.flown_by, AutopilotStandIn):
+            raise TypeError("no stand-in flies this world")
+        return self.flown_by
 
     def at(self, t: float, event: "Callable[[World], None]") -> None:
         """Let `event` happen to the world at plant time `t`: a gust, a moved bar, a dead servo."""
@@ -59,21 +100,24 @@ class World:
         """Step until cancelled, in pace with the loop's clock."""
         loop = asyncio.get_running_loop()
         start = loop.time()
-        periods = 0
-        async for tick in ticks(_CONTROL_PERIOD_S):
-            lag = tick.now - start - self.lost_s - periods * _CONTROL_PERIOD_S
+        period, periods = self._period_s, 0
+        most, sampled = round(_IN_ONE_GO_S / period), round(_SAMPLE_PERIOD_S / period)
+        async for tick in ticks(period):
+            lag = tick.now - start - self.lost_s - periods * period
             if lag > _MOST_BEHIND_S:  # the machine stalled: this time is lost
                 self.lost_s += lag - _MOST_BEHIND_S
                 lag = _MOST_BEHIND_S
             # who is late catches up in small steps, and answers the servo bus in between
-            for _ in range(min(math.floor(lag / _CONTROL_PERIOD_S + 0.5) + 1, _PERIODS_IN_ONE_GO)):
+            for _ in range(min(math.floor(lag / period + 0.5) + 1, most)):
+                if not self.flown_by.due():
+                    break
                 self._advance()
                 periods += 1
-                if periods % _SAMPLE_EVERY == 0:
-                    sample = Sample(tick.now, self.plant.state(), self.plant.truth(), self.autopilot.asked_w)
-                    self.samples.append(sample)
+                if periods % sampled == 0:
+                    asked = self.flown_by.asked_w
+                    self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth(), asked))
             for servo in self.servos.servos:
-                servo.lag_s = loop.time() - start - periods * _CONTROL_PERIOD_S
+                servo.lag_s = loop.time() - start - periods * period
 
     def _advance(self) -> None:
         """One control period."""
@@ -81,13 +125,13 @@ class World:
             self.poses.append(self.plant.pose())
         while self.events and self.events[0][0] <= self.plant.time:
             self.events.pop(0)[1](self)
-        config = self._config
-        rotors = self.autopilot.control(self.plant.state(), _CONTROL_PERIOD_S)
+        config, period = self._config, self._period_s
+        rotors = self.flown_by.control(self.plant.state(), period)
         radius = config.arm.pulley_radius_m
         tensions = self.plant.tensions()
         if coupling := config.servos.coupling:
             tensions = tuple((np.array(coupling).T @ tensions).tolist())
-        self.servos.advance(_CONTROL_PERIOD_S, [radius * tension for tension in tensions])
+        self.servos.advance(period, [radius * tension for tension in tensions])
         pulls = [
             direction * (position - zero) / _TICKS_PER_RAD * radius
             for position, zero, direction in zip(
@@ -96,5 +140,5 @@ class World:
         ]
         if coupling:
             pulls = (np.array(coupling) @ pulls).tolist()
-        for _ in range(round(_CONTROL_PERIOD_S / config.sim.step_s)):
+        for _ in range(round(period / config.sim.step_s)):
             self.plant.step(rotors, pulls)

@@ -13,6 +13,7 @@ from arm_companion.clock import run_simulated
 from arm_companion.config.schema import VehicleConfig
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.mavlink_link import MavlinkLink
+from arm_companion.drivers.path_feedforward import PathFeedforward
 from arm_companion.errors import ProtocolError
 from arm_companion.mission.facts import Control, Setpoint, VehicleState
 from arm_companion.protocol.dialect import mav
@@ -317,11 +318,31 @@ def test_a_setpoint_goes_out_whole_and_at_once(fly: Callable[..., None], flavour
         assert m.type_mask == mav.POSITION_TARGET_TYPEMASK_YAW_RATE_IGNORE
         assert (m.x, m.y, m.z) == pytest.approx(SETPOINT.position_w)
         assert (m.vx, m.vy, m.vz) == pytest.approx(SETPOINT.velocity_w)
-        assert (m.afx, m.afy, m.afz) == pytest.approx(SETPOINT.acceleration_w)
+        told = SETPOINT if flavour == "px4" else PathFeedforward().shaped(SETPOINT, now)
+        assert (m.afx, m.afy, m.afz) == pytest.approx(told.acceleration_w)
         assert m.yaw == pytest.approx(1.5)
         assert m.time_boot_ms == int(now * 1e3)
 
     fly(body, autopilot=flavour)
+
+
+def test_ardupilot_is_told_of_a_force_anew_with_every_entry_into_guided(fly: Callable[..., None]) -> None:
+    async def body(rig: Rig) -> None:
+        async def accelerations(mode: int) -> list[float]:
+            rig.peer.heartbeat(ARDUPILOT, mode)
+            await asyncio.sleep(0.05)
+            before = len(rig.peer.all("SET_POSITION_TARGET_LOCAL_NED"))
+            for _ in range(20):
+                rig.autopilot.send(SETPOINT, asyncio.get_running_loop().time())
+                await asyncio.sleep(0.01)
+            return [m.afx for m in rig.peer.all("SET_POSITION_TARGET_LOCAL_NED")[before:]]
+
+        guided = await accelerations(4)
+        assert guided[-1] < 0.9 * guided[0], "the path moves on"
+        assert set(await accelerations(5)) == {guided[0]}, "while the pilot flies, it stays at its beginning"
+        assert (await accelerations(4))[-1] == pytest.approx(guided[-1], abs=0.05), "and begins anew"
+
+    fly(body, autopilot="ardupilot")
 
 
 def test_a_setpoint_for_nobody_is_counted(fly: Callable[..., None]) -> None:
