@@ -177,8 +177,11 @@ class FlightModes:
         if refused:
             return self._flavour.refused
         if self._flavour.is_px4:
-            least = self._parameters[flavours.TAKEOFF_ALTITUDE] - self.home[2]
-            if height_m < least - 0.1:
+            least, now = self._parameters[flavours.TAKEOFF_ALTITUDE] - self.home[2], -self.estimate.position_w[2]
+            if height_m < now:  # as one over home is, given for one over the sea
+                self._say(mav.MAV_SEVERITY_WARNING, "Already higher than takeoff altitude")
+                least = height_m = now
+            elif height_m < least - 0.1:
                 self._say(mav.MAV_SEVERITY_WARNING, f"Takeoff altitude below minimum, climbing to {least:.1f} m")
             height_m = max(height_m, least)
             self._ask(Mode.TAKEOFF)

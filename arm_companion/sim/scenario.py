@@ -132,9 +132,11 @@ class Operator:
             for message in (mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE):
                 asked = [float(message), 100_000.0]
                 await self._vehicle(mav.MAV_CMD_SET_MESSAGE_INTERVAL, asked, "state messages")
-        await self._vehicle(
-            mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, float("nan"), float("nan"), float("nan"), height], "take-off"
-        )
+        nan = float("nan")
+        over_home = (
+            height if self._ardupilot else nan
+        )  # PX4 takes it for one over the sea, and has a default of its own
+        await self._vehicle(mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, nan, nan, nan, over_home], "take-off")
         await self._wait(lambda: abs(self._height() - height) < 0.15, 30.0, "the vehicle does not reach its height")
         await asyncio.sleep(2.0)
         if not self._ardupilot:
@@ -144,6 +146,8 @@ class Operator:
         self._say("external set-points on")
         await self._vehicle(mav.MAV_CMD_DO_SET_MODE, [_CUSTOM_MODE, self._external_mode()], "mode change")
         await self._wait(self._is_external, 5.0, "the autopilot does not take external set-points")
+        # each port has heartbeats of its own, a second apart: the arm may know of it later than the ground
+        await self._wait(self._arm_may_fly, 5.0, "the arm does not see that it may fly the vehicle")
 
     async def _perch(self) -> None:
         self._say("PERCH")
@@ -323,6 +327,10 @@ class Operator:
         if self._ardupilot:
             return bool(heartbeat.custom_mode == int(self._external_mode()))
         return bool((heartbeat.custom_mode >> 16) & 0xFF == _OFFBOARD)
+
+    def _arm_may_fly(self) -> bool:
+        status = self._link.latest("ARM_STATUS", self._arm)
+        return status is not None and bool(status.flags & mav.ARM_FLAG_EXTERNAL_CONTROL)
 
 
 def _vec3(values: Any) -> Vec3:

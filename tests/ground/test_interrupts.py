@@ -51,7 +51,7 @@ def perch(scripted: Any, monkeypatch: pytest.MonkeyPatch, *presses: float, abort
 
     async def main() -> int:
         scripted.script = script
-        arguments = argparse.Namespace(action="perch", json=True, timeout=None, bar=None)
+        arguments = argparse.Namespace(action="perch", json=True, timeout=None, bar=None, hang=False)
         code = await ground_orders.ACTIONS["perch"](arguments, scripted.arm)
         for task in tasks:
             task.cancel()

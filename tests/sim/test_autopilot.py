@@ -120,6 +120,18 @@ def test_take_off_altitude_is_above_sea_level_on_px4() -> None:
     scenario(test)
 
 
+def test_an_altitude_over_home_given_to_px4_lies_far_below_and_is_not_flown_to() -> None:
+    async def test(r: Rig) -> None:
+        await r.operator.wait_for(lambda o: o.latest("HOME_POSITION") is not None, 10.0)
+        await r.operator.command(TAKEOFF, (*[float("nan")] * 6, 2.2))
+        assert await r.operator.command(ARM, (1.0,)) == ACCEPTED
+        await asyncio.sleep(5.0)
+        assert abs(r.body.position[2]) < 0.1
+        assert "Already higher than takeoff altitude" in [text.text for text in r.operator.texts]
+
+    scenario(test)
+
+
 def test_return_flies_home_and_lands_there() -> None:
     async def test(r: Rig) -> None:
         await r.take_off()
