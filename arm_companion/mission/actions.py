@@ -63,6 +63,7 @@ _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the cleara
 _REST_S = 5.0
 _AT_REST_M = 0.002
 _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
+_TIGHTEN_SHARE = 0.5  # of the bend's speed, beyond the full wrap
 _BEND_AHEAD_RAD = 0.25  # three times what servos lag by while they curl the arm
 _BEHIND_CURL_M = 0.1  # a wrap in still air is followed within 5 cm
 _LEAN_RATE = 1.0  # m/s^3
@@ -133,6 +134,8 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
         return state, ArmAction.HOLD, None
     if _tight_enough(s):
         state = dataclasses.replace(state, bend_goal=state.bend)
+    elif _loose(s):
+        state = dataclasses.replace(state, bend_goal=_tighter(s))
     speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
     pulls = state.pulls
@@ -150,6 +153,23 @@ def _tight_enough(s: Situation) -> bool:
     if s.state.phase not in _CURLS or s.state.bend == s.state.bend_goal:
         return False
     return max(s.state.tension, default=0.0) >= _TIGHT_SHARE * s.config.limits.tension_max_n
+
+
+def _loose(s: Situation) -> bool:
+    """Whether a wrap has come to its full bend, or beyond, without the tension of a grip."""
+    return (
+        s.state.phase is Phase.WRAP
+        and s.state.bend == s.state.bend_goal
+        and max(s.state.tension, default=0.0) < s.grip_needed
+    )
+
+
+def _tighter(s: Situation) -> tuple[float, float]:
+    """The next goal of a wrap that bends on until it grips, up to the limit of any bend; slowly, for tension jumps."""
+    theta = math.hypot(*s.state.bend)
+    step = _TIGHTEN_SHARE * s.config.perch.bend_speed_rad_per_s * s.dt
+    scale = min(theta + step, max(s.config.limits.bend_max_rad, theta)) / theta
+    return (scale * s.state.bend[0], scale * s.state.bend[1])
 
 
 def _ahead_of_the_others(s: Situation) -> bool:

@@ -44,6 +44,7 @@ TENSE = GRASPING | GRIPPED | CARRYING | frozenset({Phase.UNLOAD, Phase.HOLDING})
 _AT_STANDOFF_M = 0.06
 _CONTACT_PERSISTS_S = 0.15
 _SETTLE_S = 1.0
+_AT_LIMIT_RAD = 1e-6
 _CONTACT_SETTLE_S = 2.5
 _AT_BAR_M = 0.03
 _PROBE_S = 3.0
@@ -81,9 +82,9 @@ def no_grip(s: Situation) -> str | None:
     """The arm is wrapped as far as allowed, yet no tendon carries a grip's tension."""
     if not wrapped(s) or s.elapsed < s.config.perch.wrap_bend_rad / s.config.perch.bend_speed_rad_per_s + _SETTLE_S:
         return None
-    if gripped(s) is not None:
+    if gripped(s) is not None or not wrapped_to_the_limit(s):
         return None
-    return f"no grip: {max(s.state.tension):.1f} N at full wrap, {s.config.perch.grip_tension_n:g} N are needed"
+    return f"no grip: {max(s.state.tension):.1f} N at full wrap, {s.grip_needed:.1f} N are needed"
 
 
 def pull_test_failed(s: Situation) -> str | None:
@@ -166,10 +167,15 @@ def wrapped(s: Situation) -> bool:
     return s.state.bend == s.state.bend_goal
 
 
+def wrapped_to_the_limit(s: Situation) -> bool:
+    """Whether the wrap must not bend any farther; in WRAP it goes on up to there while the grip is loose."""
+    return norm((*s.state.bend, 0.0)) >= s.config.limits.bend_max_rad - _AT_LIMIT_RAD
+
+
 def gripped(s: Situation) -> str | None:
     """Some tendon carries the grip tension with the wrap complete."""
     most = max(s.state.tension)
-    return f"gripped with {most:.1f} N" if wrapped(s) and most >= s.config.perch.grip_tension_n else None
+    return f"gripped with {most:.1f} N" if wrapped(s) and most >= s.grip_needed else None
 
 
 def pull_test_share(s: Situation) -> float:

@@ -244,6 +244,16 @@ class Situation:
         return (x / length, y / length) if length > 0.0 else (1.0, 0.0)
 
     @property
+    def grip_needed(self) -> float:
+        """Tension that means gripped at the present bend, N: beyond the full wrap a free arm's own tension grows too.
+
+        The outer tendon keeps the least tension, the inner has twice the bend's moment on top (model.md).
+        """
+        arm, perch = self.parameters.model.parameters, self.config.perch
+        beyond = max(math.hypot(*self.state.bend) - perch.wrap_bend_rad, 0.0)
+        return perch.grip_tension_n + beyond * arm.EI / (arm.r * arm.L)
+
+    @property
     def probe(self) -> Vec3:
         """Vehicle position when the pull test began."""
         return self.state.anchor.position_w if self.state.anchor else self.facts.vehicle.position_w

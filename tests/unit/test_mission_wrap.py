@@ -1,5 +1,6 @@
 """How a wrap is closed: no farther than tension allows, no faster than servos and vehicle follow."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -38,6 +39,33 @@ def test_a_wrap_that_is_not_tight_goes_on(parameters: Parameters, hovering: Hove
     assert place is not None
     state, _ = run(begun, changed(facts, [vehicle(position_w=place.position)]), parameters, 0.1)
     assert math.hypot(*state.bend) == pytest.approx(3.1, abs=0.02)
+
+
+def test_a_full_wrap_that_is_loose_bends_on_to_the_limit_and_no_farther(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    full, limit = parameters.config.perch.wrap_bend_rad, parameters.config.limits.bend_max_rad
+    state, facts = bending(Phase.WRAP, full, full, tension=(15.0, 4.0, 1.0, 4.0)), hovering((full, 0.0))
+    for _ in range(60):
+        facts = hovering((math.hypot(*state.bend), 0.0))
+        state, _said = run(state, facts, parameters)
+        assert state.phase is Phase.WRAP
+        assert full - 1e-9 <= math.hypot(*state.bend) <= limit + 1e-9
+    assert math.hypot(*state.bend) == pytest.approx(limit)
+    state, _said = run(dataclasses.replace(state, since=state.t - 20.0), facts, parameters)
+    assert state.phase is Phase.UNLOAD
+
+
+def test_what_a_grip_needs_beyond_the_full_wrap_is_more_by_what_a_free_arm_gains(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    limit = parameters.config.limits.bend_max_rad
+    tension = parameters.config.perch.grip_tension_n + 0.3
+    facts = hovering((limit, 0.0))
+    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension, 4.0, 1.0, 4.0)), facts, parameters)
+    assert state.phase is Phase.WRAP
+    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension + 1.0, 4.0, 1.0, 4.0)), facts, parameters)
+    assert state.phase is Phase.VERIFY
 
 
 @pytest.mark.parametrize("phase", [Phase.WRAP, Phase.RELEASE])
