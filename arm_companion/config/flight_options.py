@@ -19,7 +19,7 @@ class LimitsConfig:
     tension_disagreement_s: float = option("for how long they must differ", 0.5, unit="s", lower=0.05, upper=30.0)
     pull_max_m: float = option("tendon taken in or let out, from straight", 0.12, unit="m", lower=0.001, upper=2.0)
     pull_speed_m_per_s: float = option("tendon speed", 0.05, unit="m/s", lower=0.001, upper=1.0)
-    bend_max_rad: float = option("commanded bend of the free arm", 5.1, unit="rad", lower=0.1, upper=4 * math.pi)
+    bend_max_rad: float = option("commanded bend of the free arm", 5.5, unit="rad", lower=0.1, upper=4 * math.pi)
     wrench_force_n: float = option("predicted force on the airframe", 12.0, unit="N", lower=0.1, upper=500.0)
     wrench_moment_nm: float = option("predicted moment on the airframe", 2.5, unit="N m", lower=0.01, upper=200.0)
     vehicle_speed_m_per_s: float = option("set-point speed near the bar", 0.3, unit="m/s", lower=0.01, upper=5.0)

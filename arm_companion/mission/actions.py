@@ -63,6 +63,7 @@ _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the cleara
 _REST_S = 5.0
 _AT_REST_M = 0.002
 _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
+_AT_BEND_RAD = 1e-6
 _TIGHTEN_SHARE = 0.5  # of the bend's speed, beyond the full wrap
 _BEND_AHEAD_RAD = 0.25  # three times what servos lag by while they curl the arm
 _BEHIND_CURL_M = 0.1  # a wrap in still air is followed within 5 cm
@@ -160,6 +161,7 @@ def _loose(s: Situation) -> bool:
     return (
         s.state.phase is Phase.WRAP
         and s.state.bend == s.state.bend_goal
+        and math.hypot(*s.state.bend) >= s.config.perch.wrap_bend_rad - _AT_BEND_RAD
         and max(s.state.tension, default=0.0) < s.grip_needed
     )
 

@@ -151,7 +151,7 @@ def test_an_actuator_bends_the_arm_where_it_is_mapped() -> None:
         await soon()
         (request,), _ = rig.component.take()
         assert request.order is Order.JOG
-        assert request.parameters == pytest.approx((1.0, -0.5 * 5.1, 0.0))
+        assert request.parameters == pytest.approx((1.0, -0.5 * 5.5, 0.0))
         rig.ground.command(command, 0.5, NAN, NAN, NAN, NAN, NAN, 0.0, to=(1, 0))  # another actuator
         rig.ground.command(command, NAN, 1.5, NAN, NAN, NAN, NAN, 0.0)
         await soon()

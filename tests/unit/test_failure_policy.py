@@ -87,7 +87,7 @@ def _slip(state: State) -> State:
 
 
 def _loose_wrap(state: State) -> State:
-    return dataclasses.replace(state, since=T0 - 20.0, bend=(4.9, 0.0), bend_goal=(4.9, 0.0))
+    return dataclasses.replace(state, since=T0 - 20.0, bend=(5.5, 0.0), bend_goal=(5.5, 0.0))
 
 
 def weighed(state: State, kilograms: float) -> State:

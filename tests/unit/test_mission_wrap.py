@@ -46,7 +46,7 @@ def test_a_full_wrap_that_is_loose_bends_on_to_the_limit_and_no_farther(
 ) -> None:
     full, limit = parameters.config.perch.wrap_bend_rad, parameters.config.limits.bend_max_rad
     state, facts = bending(Phase.WRAP, full, full, tension=(15.0, 4.0, 1.0, 4.0)), hovering((full, 0.0))
-    for _ in range(60):
+    for _ in range(150):
         facts = hovering((math.hypot(*state.bend), 0.0))
         state, _said = run(state, facts, parameters)
         assert state.phase is Phase.WRAP
@@ -59,12 +59,15 @@ def test_a_full_wrap_that_is_loose_bends_on_to_the_limit_and_no_farther(
 def test_what_a_grip_needs_beyond_the_full_wrap_is_more_by_what_a_free_arm_gains(
     parameters: Parameters, hovering: Hovering
 ) -> None:
-    limit = parameters.config.limits.bend_max_rad
-    tension = parameters.config.perch.grip_tension_n + 0.3
+    limit, perch = parameters.config.limits.bend_max_rad, parameters.config.perch
+    arm = parameters.model.parameters
+    free_arm_gains = (limit - perch.wrap_bend_rad) * arm.EI / (arm.r * arm.L)
+    assert free_arm_gains > 1.0
+    tension = perch.grip_tension_n + free_arm_gains
     facts = hovering((limit, 0.0))
-    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension, 4.0, 1.0, 4.0)), facts, parameters)
+    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension - 0.1, 4.0, 1.0, 4.0)), facts, parameters)
     assert state.phase is Phase.WRAP
-    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension + 1.0, 4.0, 1.0, 4.0)), facts, parameters)
+    state, _ = run(bending(Phase.WRAP, limit, limit, tension=(tension + 0.1, 4.0, 1.0, 4.0)), facts, parameters)
     assert state.phase is Phase.VERIFY
 
 
