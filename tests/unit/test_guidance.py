@@ -179,7 +179,7 @@ def test_a_way_to_safety_ends_the_stream(order: str) -> None:
     ("changes", "reason"),
     [
         ({"theta": NAN}, "theta"),
-        ({"theta": 5.2}, "theta"),
+        ({"theta": 5.6}, "theta"),
         ({"delta": math.inf}, "delta"),
         ({"delta": 7.0}, "delta"),
         ({"kind": 1}, "tip_position"),

@@ -62,7 +62,7 @@ def test_every_parameter_reads_and_writes_its_option_within_the_schemas_bounds(p
 
 def test_rules_that_span_two_options_hold_and_whole_numbers_stay_whole() -> None:
     with pytest.raises(ConfigError, match="wrap_bend_rad"):
-        BY_NAME["PERCH_WRAP_BEND"].write(Config(), 5.5)
+        BY_NAME["PERCH_WRAP_BEND"].write(Config(), 5.6)
     with pytest.raises(ConfigError, match="whole number"):
         COMPID.write(Config(), 12.5)
 
