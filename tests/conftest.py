@@ -9,7 +9,8 @@ from arm_companion.protocol.tunnel import unwrap
 from arm_companion.transport.base import Transport
 from arm_companion.transport.memory import MemoryPipe
 
-hypothesis.settings.register_profile("shared machine", deadline=None)
+# the same examples in every run: what fails here has been brought in by a change. Others: --hypothesis-profile=default
+hypothesis.settings.register_profile("shared machine", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("shared machine")
 
 

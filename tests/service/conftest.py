@@ -26,7 +26,8 @@ mount --make-rprivate /
 mount -t proc proc /proc
 mount -t tmpfs tmpfs /run
 mkdir /run/units && cp -r "$1"/. /run/units
-for place in /tmp /var/lib /var/log /var/cache; do mount -t tmpfs tmpfs "$place"; done
+shift
+for place; do mount -t tmpfs tmpfs "$place"; done
 umount -l /sys/fs/cgroup 2> /dev/null || true
 mount -t tmpfs tmpfs /sys/fs/cgroup
 mount -t cgroup2 cgroup2 /sys/fs/cgroup
@@ -38,8 +39,9 @@ _TARGET = """
 Description=what the tests start
 Wants=arm-companion.service
 """
+_WRITTEN = ("/var/lib", "/var/log", "/var/cache")
 _PRESUMED = ("sysinit.target", "basic.target", "shutdown.target", "network.target", "time-sync.target")  # of any system
-# What the shipped unit has otherwise: the interpreter and the checkout under test may lie in a home directory.
+# What the shipped unit has otherwise: interpreter and checkout may lie in a home directory, or in /tmp.
 _DROP_IN = """
 [Service]
 ExecStart=
@@ -47,6 +49,7 @@ ExecStart={command}
 User=root
 Group=root
 ProtectHome=no
+PrivateTmp=no
 ConfigurationDirectory=
 """
 
@@ -131,12 +134,14 @@ def boot(tmp_path: Path) -> Iterator[Callable[[str], Machine]]:
         (units / "default.target").write_text(_TARGET)
         for name in _PRESUMED:
             (units / name).write_text("[Unit]\nDefaultDependencies=no\n")
+        needed = (str(ROOT), sys.prefix, sys.base_prefix)
+        hidden = [place for place in _WRITTEN if not any(path.startswith(f"{place}/") for path in needed)]
         command = f"{sys.executable} -m arm_companion {words}"
         drop_in = _DROP_IN.format(command=command) + f"WorkingDirectory={ROOT}\n"
         (units / "arm-companion.service.d" / "test.conf").write_text(drop_in)
         process = subprocess.Popen(
             ["unshare", "--mount", "--pid", "--fork", "--kill-child", "--cgroup", "--ipc", "--uts", "sh", "-c", _BOOT,
-             "sh", str(units)],
+             "sh", str(units), *hidden],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
