@@ -168,6 +168,12 @@ class Load:
         """Whether a load can be weighed now."""
         return self.curve is not None and self.curve.calibrated and math.isfinite(self.now)
 
+    def sigma_now(self, vehicle_mass: float) -> float:
+        """One sigma of `now`, kg: of the curve, and of what the low-pass filter leaves of the signals' errors."""
+        if self.curve is None or self.flow is None:
+            return math.inf
+        return vehicle_mass / GRAVITY * math.hypot(self.curve.sigma(self.flow), math.sqrt(0.5 * _POLE * _SPECTRUM))
+
     def sigma(self, vehicle_mass: float) -> float:
         """One sigma of `mass`, kg: of the curve, of the mean, and of the mass of the vehicle that all is counted in."""
         if not self.weighed_s:

@@ -31,7 +31,7 @@ _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
 _HELD_TENSION_SIGMA = 1.0  # N, on top of it
 _LEAST_HZ = 5.0
 # the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
-_FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes
+_FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes; down, where the thrust is not known
 _SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides
 _MOMENT_SIGMA = 0.15  # N m, of what the bar passes on besides the force
 _SPREAD = Spread(hold_position=0.005, hold_rotation=0.03)
@@ -201,17 +201,17 @@ def _spread(s: Situation, solution: ArmSolution) -> Spread:
 def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
     """Model and motion, each axis by its variance: a millimetre is half a newton, but the vehicle feels a tenth.
 
-    What the vehicle feels comes from the force observer, north and east. Down, where no sensor tells the thrust
-    and where a wrap slides on its bar rather than stretch, stands the arm's weight less our own push, give or take
-    what the bar's friction holds. The bar passes on a moment besides the force that nothing measures; it is only
-    in the sigma.
+    What the vehicle feels comes from the force observer, north and east. Down, where a wrap slides on its bar rather
+    than stretch, it is the arm's weight and what the rotors lift beyond the vehicle's; as far as their thrust is not
+    known, the arm's weight less our own push, give or take what the bar's friction holds. The bar passes on a moment
+    besides the force that nothing measures; it is only in the sigma.
     """
     R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
     model = R_wb @ found.wrench[:3]
     model_variance = R_wb**2 @ found.sigma[:3] ** 2 + np.square(_SLIDE_SIGMA)
-    push = s.config.vehicle.mass_kg * s.state.lean[2]
-    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY - push))
-    felt_variance = np.square(_FELT_SIGMA)
+    down, down_variance = _carried(s)
+    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY + down))
+    felt_variance = np.array((*np.square(_FELT_SIGMA[:2]), down_variance))
     share = felt_variance / (felt_variance + model_variance)
     force = R_wb.T @ (share * model + (1.0 - share) * felt)
     sigma = np.sqrt(R_wb.T**2 @ (share * model_variance))
@@ -222,6 +222,16 @@ def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
         wrench=np.concatenate((force, so3.cross(arm, force))),
         sigma=np.concatenate((sigma, np.hypot(lever, _MOMENT_SIGMA))),
     )
+
+
+def _carried(s: Situation) -> tuple[float, float]:
+    """Force of the bar on the arm, N, down, and its variance: our own push turned round, and what the rotors tell."""
+    push, load, mass = -s.config.vehicle.mass_kg * s.state.lean[2], s.state.load, s.config.vehicle.mass_kg
+    variance = _FELT_SIGMA[2] ** 2
+    if math.isnan(load.now):
+        return push, variance
+    share = variance / (variance + (load.sigma_now(mass) * GRAVITY) ** 2)
+    return push + share * (load.now * GRAVITY - push), (1.0 - share) * variance
 
 
 def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import pytest
 
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import (
     Answer,
     ArmAction,
@@ -22,6 +23,7 @@ from arm_companion.mission.facts import (
     WrenchSource,
 )
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Running, State
 from arm_companion.mission.wrench import grip
@@ -209,6 +211,28 @@ def test_the_feedforward_leans_the_way_that_the_arm_pulls_back(parameters: Param
     assert 0.2 < north < parameters.config.limits.feedforward_m_per_s2
     assert abs(east) < 0.1 * north
     assert down == 0.0
+
+
+def test_down_a_perched_vehicle_feels_what_its_rotors_lift_beyond_its_weight(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    bend, mass, share = (4.9, 0.0), parameters.config.vehicle.mass_kg, 0.5
+    curve = ThrustCurve(share, (GRAVITY, GRAVITY / share, 0.1), ((1e-4, 0.0, 0.0), (0.0, 1e-2, 0.0), (0.0, 0.0, 1e-4)))
+    weighed = Load(curve=curve, flow=Flow(1.0, share, 0.0), seen_s=5.0)
+    held = at(Phase.PERCHED, bend=bend, bend_goal=bend, position=(2.0, 0.0, -2.2), tension=(25.0, 9.0, 0.5, 9.0))
+    anchor = grip(Situation(held, hovering(bend), 100.0, parameters))
+
+    def wrench(load: Load, extra: float) -> WrenchReport:
+        facts = hovering(bend, thrust=share * (1.0 + extra / (mass * GRAVITY)))
+        _, said = run(dataclasses.replace(held, anchor=anchor, load=load), facts, parameters, 3.0)
+        assert said[-1].wrench.valid
+        return said[-1].wrench
+
+    unweighed, level, pulled = wrench(NO_LOAD, 2.0), wrench(weighed, 0.0), wrench(weighed, 2.0)
+    assert pulled.force_b[2] - level.force_b[2] == pytest.approx(2.0, rel=0.03)
+    assert unweighed.force_b[2] == pytest.approx(level.force_b[2], abs=0.1)
+    assert 0.05 < pulled.force_sigma[2] < 0.3
+    assert unweighed.force_sigma[2] > 1.0
 
 
 def test_a_vertical_move_pushes_harder_until_the_limit_and_lets_go_when_the_move_ends(
