@@ -8,6 +8,23 @@ from arm_companion.config.options import option, section
 
 
 @dataclass(frozen=True)
+class KeepOutConfig:
+    """[limits.keep_out] A cone that the arm never enters: around propellers, landing gear and hull."""
+
+    apex_m: tuple[float, ...] = option(
+        "its apex from the airframe's centre of mass, body axes; from there it opens towards that centre and beyond",
+        (0.0, 0.0, 0.05),
+        unit="m",
+        lower=-2.0,
+        upper=2.0,
+        length=3,
+    )
+    half_angle_deg: float = option(
+        "between its axis and its surface; 0: no cone", 0.0, unit="deg", lower=0.0, upper=89.0
+    )
+
+
+@dataclass(frozen=True)
 class LimitsConfig:
     """[limits] What no command that leaves may exceed."""
 
@@ -24,6 +41,7 @@ class LimitsConfig:
     wrench_moment_nm: float = option("predicted moment on the airframe", 2.5, unit="N m", lower=0.01, upper=200.0)
     vehicle_speed_m_per_s: float = option("set-point speed near the bar", 0.3, unit="m/s", lower=0.01, upper=5.0)
     feedforward_m_per_s2: float = option("acceleration feed-forward", 3.5, unit="m/s^2", lower=0.0, upper=8.0)
+    keep_out: KeepOutConfig = section(KeepOutConfig)
 
 
 @dataclass(frozen=True)

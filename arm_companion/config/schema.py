@@ -4,6 +4,7 @@ Keys follow the sections of the TOML files in `configs/`. SI units throughout; w
 its suffix says so.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -16,6 +17,7 @@ from arm_companion.config.arm_options import (
     SegmentConfig,
 )
 from arm_companion.config.flight_options import (
+    KeepOutConfig,
     LimitsConfig,
     PerchConfig,
     RatesConfig,
@@ -42,6 +44,7 @@ __all__ = [
     "Config",
     "GraspConfig",
     "HangConfig",
+    "KeepOutConfig",
     "LimitsConfig",
     "LinkConfig",
     "MavlinkConfig",
@@ -58,6 +61,9 @@ __all__ = [
     "SimObjectConfig",
     "VehicleConfig",
 ]
+
+
+_LEAST_APEX_M = 0.005
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,9 @@ class Config:
                 f"perch.wrap_bend_rad = {self.perch.wrap_bend_rad:g} is over limits.bend_max_rad = "
                 f"{self.limits.bend_max_rad:g}"
             )
+        keep_out = self.limits.keep_out
+        if keep_out.half_angle_deg and math.hypot(*keep_out.apex_m) < _LEAST_APEX_M:
+            raise ConfigError("limits.keep_out.apex_m is at the centre of mass: the cone would have no direction")
         if sum(link.role == "autopilot" for link in self.links.values()) > 1:
             raise ConfigError("links: more than one link has the role autopilot")
 

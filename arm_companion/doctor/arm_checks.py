@@ -3,12 +3,15 @@
 from collections.abc import Iterator
 from typing import Final
 
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import Config
 from arm_companion.doctor.check import Check, Outcome, fail, ok, skipped, warn
 from arm_companion.doctor.machine_checks import no_config
 from arm_companion.doctor.subject import ServosSeen, Subject
 from arm_companion.drivers import calibration_files
 from arm_companion.drivers.calibration import TendonCalibration, curves, misfit, too_old
+from arm_companion.mission.situation import Parameters
 
 _LOSS_SHARE: Final = 0.01
 _MARGIN_V: Final = 0.5
@@ -126,6 +129,28 @@ def _against_servos(found: TendonCalibration, seen: ServosSeen | str) -> Iterato
                 )
 
 
+def keep_out(subject: Subject) -> Iterator[Outcome]:
+    """Whether there is a cone that keeps the arm from the propellers, and room for the full wrap beside it."""
+    config = subject.config
+    if config is None:
+        yield no_config(subject)
+        return
+    if not config.limits.keep_out.half_angle_deg:
+        yield warn(
+            "there is no cone: limits.bend_max_rad and the mount alone keep the arm away",
+            "measure where propellers and landing gear are, and set limits.keep_out",
+        )
+        return
+    clearance = Parameters(config, RodModel(ArmParameters.of(config.arm))).wrap_clearance
+    if clearance < 0.0:
+        yield fail(
+            f"the full wrap is {-clearance * 100:.1f} cm inside the cone, so PERCH and GRASP are refused",
+            "a longer mount, a smaller perch.wrap_bend_rad, or a cone that fits the airframe",
+        )
+    else:
+        yield ok(f"the full wrap stays {clearance * 100:.1f} cm away from it")
+
+
 def _listed(ids: list[int]) -> str:
     return ", ".join(map(str, ids))
 
@@ -133,5 +158,6 @@ def _listed(ids: list[int]) -> str:
 CHECKS: Final = (
     Check("servos", "each of them holds one tendon; an arm with one less cannot be commanded", servos),
     Check("voltage", "servos that are short of voltage shut down while they hold the vehicle", voltage),
+    Check("keep-out cone", "an arm that curls into a propeller is the end of the flight", keep_out),
     Check("calibration", "without zeros of its own the arm bends elsewhere than it is told", calibration),
 )

@@ -156,6 +156,17 @@ def _drawn(record: Record, cycle: Situation) -> dict[str, Any]:
         "disk_radius": cycle.config.perch.disk_radius_m,
         "backbone": seen.backbone_b,
         "bar": None if seen.bar is None else dataclasses.asdict(seen.bar),
+        "keep_out": _keep_out(cycle),
         "force": wrench.force_b if known else None,
         "torque": wrench.torque_b if known else None,
     }
+
+
+def _keep_out(cycle: Situation) -> dict[str, Any] | None:
+    """The keep-out cone, body axes; None: there is none."""
+    cone = cycle.config.limits.keep_out
+    if not cone.half_angle_deg:
+        return None
+    away = math.hypot(*cone.apex_m)
+    axis = [-x / away for x in cone.apex_m]
+    return {"apex": cone.apex_m, "axis": axis, "half_angle": math.radians(cone.half_angle_deg)}

@@ -39,6 +39,9 @@ _GREY: Final = Color(r=0.45, g=0.48, b=0.52, a=1.0)
 _PALE: Final = Color(r=0.45, g=0.48, b=0.52, a=0.35)
 _BLUE: Final = Color(r=0.18, g=0.45, b=0.85, a=1.0)
 _DISK: Final = Color(r=0.18, g=0.45, b=0.85, a=0.3)
+_CONE_HEIGHT: Final = 0.25
+_CONE_RADIUS: Final = 0.4
+_FORBIDDEN: Final = Color(r=0.85, g=0.15, b=0.12, a=0.12)
 _BROWN: Final = Color(r=0.65, g=0.42, b=0.15, a=1.0)
 _RED: Final = Color(r=0.85, g=0.15, b=0.12, a=1.0)
 _VIOLET: Final = Color(r=0.6, g=0.25, b=0.8, a=1.0)
@@ -85,6 +88,8 @@ def scene(ns: int, table: dict[str, Any]) -> SceneUpdate:
     entities = [_vehicle(ns), _arm(ns, table["backbone"], table["disk_radius"])]
     if table["bar"] is not None:
         entities.append(_bar(ns, table["bar"]))
+    if table["keep_out"] is not None:
+        entities.append(_keep_out(ns, table["keep_out"]))
     if table["force"] is not None:
         entities.append(_wrench(ns, table["force"], table["torque"]))
     return SceneUpdate(entities=entities)
@@ -123,6 +128,22 @@ def _bar(ns: int, bar: dict[str, Any]) -> SceneEntity:
         color=_BROWN,
     )
     return _entity(ns, "bar", cylinders=[cylinder])
+
+
+def _keep_out(ns: int, cone: dict[str, Any]) -> SceneEntity:
+    """The cone as far as it hides the airframe; it has no end."""
+    slope = math.tan(cone["half_angle"])
+    height = min(_CONE_HEIGHT, _CONE_RADIUS / slope)
+    radius = height * slope
+    middle = [p + 0.5 * height * a for p, a in zip(cone["apex"], cone["axis"], strict=True)]
+    cylinder = CylinderPrimitive(
+        pose=_pose(middle, turn_to((0.0, 0.0, 1.0), cone["axis"])),
+        size=Vector3(x=2 * radius, y=2 * radius, z=height),
+        bottom_scale=0.0,
+        top_scale=1.0,
+        color=_FORBIDDEN,
+    )
+    return _entity(ns, "keep-out", cylinders=[cylinder])
 
 
 def _wrench(ns: int, force: Vector, torque: Vector) -> SceneEntity:

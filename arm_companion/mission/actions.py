@@ -139,6 +139,8 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
         state = dataclasses.replace(state, bend_goal=_tighter(s))
     speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
+    if not s.parameters.admits(state.bend, bend):
+        bend = state.bend
     pulls = state.pulls
     if bend != state.bend or not pulls:
         goal = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))

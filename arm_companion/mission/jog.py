@@ -62,7 +62,10 @@ def _bend(s: Situation, theta: float, delta: float) -> tuple[float, float]:
     """Bend u, rad, of an arc's `theta` and `delta`, within the limit."""
     if abs(theta) > s.config.limits.bend_max_rad:
         raise CommandRejected(f"a bend of {theta:.2f} rad is over {s.config.limits.bend_max_rad:g} rad")
-    return theta * math.cos(delta), theta * math.sin(delta)
+    bend, keep_out = np.array((theta * math.cos(delta), theta * math.sin(delta))), s.parameters.keep_out
+    if keep_out is not None and (depth := -keep_out.clearance(bend)) > 0.0:
+        raise CommandRejected(f"a bend of {theta:.2f} rad is {depth * 100:.1f} cm inside the keep-out cone")
+    return float(bend[0]), float(bend[1])
 
 
 def _bend_for_tip(s: Situation, tip_a: Vec3) -> tuple[float, float]:

@@ -22,4 +22,10 @@ def cannot_set_out(s: Situation, target: Bar, name: str) -> str | None:
         return f"the {name} is {distance:.0f} m away; at most {_WITHIN_M:g} m are allowed"
     if abs(target.axis_w[2]) > _LEVEL:
         return f"the {name} is not level"
-    return hot(s) or low_voltage(s)
+    return hot(s) or low_voltage(s) or _wraps_into_keep_out(s)
+
+
+def _wraps_into_keep_out(s: Situation) -> str | None:
+    """The full wrap would take the arm where propellers or landing gear are: a matter of the configuration."""
+    depth = -s.parameters.wrap_clearance
+    return f"the full wrap is {depth * 100:.1f} cm inside the keep-out cone" if depth > 0.0 else None

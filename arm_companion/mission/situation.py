@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from arm_companion.arm.keep_out import KeepOut
 from arm_companion.arm.model import ArmModel
 from arm_companion.arm.reaction import GRAVITY, mount
 from arm_companion.config.schema import Config
@@ -18,7 +19,7 @@ from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
-_FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
+_FROM_FACTS = frozenset({"gravity_a", "bend"})
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,40 @@ class Parameters:
 
     config: Config
     model: ArmModel
+
+    @cached_property
+    def mount(self) -> Pose:
+        """T_ba: the arm's base on the airframe."""
+        return mount(self.config.mount.position_m, self.config.mount.rpy_deg)
+
+    @cached_property
+    def keep_out(self) -> KeepOut | None:
+        """The cone that the arm never enters; None: there is none."""
+        cone = self.config.limits.keep_out
+        if not cone.half_angle_deg:
+            return None
+        half_angle, radius = math.radians(cone.half_angle_deg), self.config.perch.disk_radius_m
+        return KeepOut.of(np.asarray(cone.apex_m), half_angle, self.mount, self.model.parameters.L, radius)
+
+    @cached_property
+    def towards_bar_a(self) -> tuple[float, float]:
+        """Direction of bending, base axes, in which a vehicle that faces the bar wraps it."""
+        x, y, _ = _column(self.mount.rotation.T, 0)  # forward in base axes
+        length = math.hypot(x, y)
+        return (x / length, y / length) if length > 0.0 else (1.0, 0.0)
+
+    @cached_property
+    def wrap_clearance(self) -> float:
+        """Least distance of arm and keep-out cone on the way to the full wrap, m; infinite without a cone."""
+        if self.keep_out is None:
+            return math.inf
+        return self.keep_out.least_on_way(np.zeros(2), self.config.perch.wrap_bend_rad * np.array(self.towards_bar_a))
+
+    def admits(self, bend: tuple[float, float], next_bend: tuple[float, float]) -> bool:
+        """Whether the keep-out cone lets the arm go on from one bend to the next, rad."""
+        if self.keep_out is None or bend == next_bend:
+            return True
+        return self.keep_out.admits(np.asarray(bend), np.asarray(next_bend))
 
 
 @dataclass(frozen=True)
@@ -92,10 +127,10 @@ class Situation:
         """Whether the autopilot left our mode since the previous step, whoever made it."""
         return self.state.control is Control.EXTERNAL and not self.external
 
-    @cached_property
+    @property
     def mount(self) -> Pose:
         """T_ba: the arm's base on the airframe."""
-        return mount(self.config.mount.position_m, self.config.mount.rpy_deg)
+        return self.parameters.mount
 
     @cached_property
     def gravity_a(self) -> Vec3:
@@ -239,9 +274,7 @@ class Situation:
     @property
     def towards_bar_a(self) -> tuple[float, float]:
         """Direction of bending, base axes, in which a vehicle that faces the bar wraps it."""
-        x, y, _ = _column(self.mount.rotation.T, 0)  # forward in base axes
-        length = math.hypot(x, y)
-        return (x / length, y / length) if length > 0.0 else (1.0, 0.0)
+        return self.parameters.towards_bar_a
 
     @property
     def grip_needed(self) -> float:

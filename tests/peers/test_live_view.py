@@ -237,6 +237,9 @@ def test_the_scene_has_vehicle_arm_bar_and_wrench_and_leaves_out_what_is_not_kno
     assert b"body" in transforms(1, drawn).encode()
     fresh, stale = (transforms(1, drawn | {"fresh": fresh}).encode() for fresh in (True, False))
     assert len(stale) < len(fresh), "a vehicle that is not known stands nowhere"
+    cone = {"apex": (0.0, 0.0, 0.05), "axis": (0.0, 0.0, -1.0), "half_angle": 1.0}
+    assert b"keep-out" not in scene(1, drawn | {"keep_out": None}).encode()
+    assert b"keep-out" in scene(1, drawn | {"keep_out": cone}).encode()
     zero = drawn | {"force": (0.0, 0.0, 0.0), "torque": (0.0, 0.0, 0.0)}
     assert len(scene(1, zero).encode()) < whole, "no wrench, no arrow"
 

@@ -18,7 +18,14 @@ from arm_companion.__main__ import main
 from arm_companion.arm.compiled import NotCompiled
 from arm_companion.cli import doctor as command
 from arm_companion.config import Config
-from arm_companion.config.schema import CalibrationConfig, LinkConfig, MqttConfig, RecordConfig
+from arm_companion.config.schema import (
+    CalibrationConfig,
+    KeepOutConfig,
+    LimitsConfig,
+    LinkConfig,
+    MqttConfig,
+    RecordConfig,
+)
 from arm_companion.doctor import report
 from arm_companion.doctor.check import Check, Finding, Level, Outcome, examine, ok, warn
 from arm_companion.doctor.redaction import HIDDEN, redact
@@ -47,6 +54,10 @@ def machine(root: Path, **changes: Any) -> Machine:
     return dataclasses.replace(plain, **changes)
 
 
+def fenced(degrees: float) -> LimitsConfig:
+    return LimitsConfig(keep_out=KeepOutConfig(half_angle_deg=degrees))
+
+
 @pytest.fixture
 def subject(tmp_path: Path) -> Subject:
     """Where nothing is wrong."""
@@ -55,6 +66,7 @@ def subject(tmp_path: Path) -> Subject:
         record=RecordConfig(directory=str(tmp_path)),
         calibration=CalibrationConfig(directory=str(tmp_path)),
         vehicle=dataclasses.replace(CONFIG.vehicle, commanders=(255,)),
+        limits=fenced(60.0),
     )
     calibration_files.save(tmp_path / calibration_files.TENDONS, calibration())
     lay(tmp_path, "sys/devices/system/cpu/cpufreq/policy0/scaling_governor", "performance\n")
@@ -131,6 +143,9 @@ def test_where_nothing_is_wrong_every_check_is_well_and_has_its_reason(subject: 
         ("disk", {"machine": {"free_bytes": lambda _: 10**9}}, Level.WARN, "room for 0.8 h"),
         ("disk", {"machine": {"free_bytes": lambda _: 10**6}}, Level.FAIL, "1 MB are free"),
         ("disk", {"config": CONFIG}, Level.WARN, "nothing is kept"),
+        ("keep-out cone", {"config": CONFIG}, Level.WARN, "there is no cone"),
+        ("keep-out cone", {"config": dataclasses.replace(CONFIG, limits=fenced(88.0))}, Level.FAIL, "inside the cone"),
+        ("keep-out cone", {"config": dataclasses.replace(CONFIG, limits=fenced(60.0))}, Level.OK, "1.5 cm away"),
         ("calibration", {"config": CONFIG}, Level.WARN, "there is none"),
         ("versions", {"machine": {"version": {"numpy": "1.20.0", "fastcrc": "1", "pyserial": "3.5"}.get}}, Level.FAIL,
          "numpy 1.20.0 is older than 1.26"),
