@@ -16,7 +16,14 @@ from arm_companion.cli.common import add_config_arguments, add_live_argument, lo
 from arm_companion.config import Config
 from arm_companion.errors import ArmError, ConfigError
 
-_CONFIGS = {"perch": "sim.toml", "hang": "sim_hang.toml", "grasp": "sim_grasp.toml", "world": "sim.toml"}
+_CONFIGS = {
+    "perch": "sim.toml",
+    "hang": "sim_hang.toml",
+    "grasp": "sim_grasp.toml",
+    "abort": "sim.toml",
+    "gust": "sim_gust.toml",
+    "world": "sim.toml",
+}
 _FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
@@ -26,10 +33,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "scenario",
         choices=tuple(_CONFIGS),
         help="perch: take off, wrap a bar, be pulled, let go, land; hang: wrap a bar overhead, hang with idle motors, "
-        "let go, land; grasp: pick an object up and put it back, without and with compensation, land; world: no "
-        "script, your own ground station flies",
+        "let go, land; grasp: pick an object up and put it back, without and with compensation, land; abort: one "
+        "perch after the other, each aborted in another state; gust: a perch in gusts; world: no script, your own "
+        "ground station flies",
     )
-    add_config_arguments(parser, default="sim.toml, for hang and grasp sim_hang.toml and sim_grasp.toml")
+    add_config_arguments(
+        parser, default="sim.toml, or the scenario's own: sim_hang.toml, sim_grasp.toml, sim_gust.toml"
+    )
     parser.set_defaults(config=None)
     add_live_argument(parser)
     parser.add_argument("--simulated", action="store_true", help="one process in simulated time, as fast as it goes")
@@ -79,7 +89,10 @@ def _count(text: str) -> int:
 def run(arguments: argparse.Namespace) -> int:
     """Fly the scenario; exit code 0 only when it did what it is for."""
     if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
-        print("arm-companion sim: --trials flies in simulated time: sim perch|hang|grasp --simulated", file=sys.stderr)
+        print(
+            "arm-companion sim: --trials needs --simulated and a scenario with a script",
+            file=sys.stderr,
+        )
         return 2
     if arguments.live is not None and arguments.simulated:
         print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
@@ -107,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _no_video(arguments: argparse.Namespace) -> str:
     """Why there can be no film whatever is installed; empty: there can."""
     if arguments.scenario == "world" or arguments.trials is not None:
-        return "films one flight: sim perch or hang, without --trials"
+        return "films one flight with a script, without --trials"
     if arguments.video.suffix not in _FILMS:
         return f"{arguments.video}: a film's name ends with one of {', '.join(_FILMS)}"
     return ""
@@ -292,7 +305,17 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "wall_s": round(wall_s, 3),
         "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
     }
-    return contract | (_grasp_summary(verdict) if scenario == "grasp" else {})
+    further = {"grasp": _grasp_summary, "abort": _abort_summary}.get(scenario, lambda _: {})
+    return contract | further(verdict)
+
+
+def _abort_summary(verdict: Any) -> dict[str, Any]:
+    """What a flight with aborts has besides."""
+    return {
+        "aborts": [
+            {"state": a.state, "let_go_s": _number(a.let_go_s), "sank_m": _number(a.sank_m)} for a in verdict.aborts
+        ]
+    }
 
 
 def _grasp_summary(verdict: Any) -> dict[str, Any]:

@@ -175,6 +175,9 @@ class SimConfig:
     wind_m_per_s: tuple[float, ...] = option(
         "steady wind, NED", (0.0, 0.0, 0.0), unit="m/s", lower=-30.0, upper=30.0, length=3
     )
+    gust_m_per_s: float = option(
+        "greatest peak of the gusts on top of it, from any side; 0: none", 0.0, unit="m/s", lower=0.0, upper=30.0
+    )
     autopilot_url: str = option("the stand-in's companion port", "udpout:127.0.0.1:14540")
     operator_autopilot_url: str = option("where the operator hears the autopilot", "udpin:127.0.0.1:14550")
     operator_arm_url: str = option("where the operator hears the daemon", "udpin:127.0.0.1:14560")

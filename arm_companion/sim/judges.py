@@ -5,9 +5,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from arm_companion.config.schema import Config
+from arm_companion.sim.abort_verdict import judge_aborts
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.grasp_verdict import judge_grasp
 from arm_companion.sim.hang_verdict import judge_hang
+from arm_companion.sim.mishaps import fly_aborts, fly_in_gusts, fly_one_abort
 from arm_companion.sim.mjcf import GRAVITY
 from arm_companion.sim.scenario import Operator
 from arm_companion.sim.verdict import Verdict, judge
@@ -44,6 +46,16 @@ SCENARIOS: Mapping[str, Scenario] = {
         "hung and left",
         Operator.fly_hang,
         lambda flight, failure, world: judge_hang(flight, failure, GRAVITY * world.vehicle.mass_kg),
+    ),
+    "abort": Scenario(
+        "Aborted perches",
+        "let go each time",
+        fly_aborts,
+        lambda flight, failure, _: judge_aborts(flight, failure),
+        fly_one_abort,
+    ),
+    "gust": Scenario(
+        "Anchor perch in gusts", "perched and let go", fly_in_gusts, lambda flight, failure, _: judge(flight, failure)
     ),
     "grasp": Scenario("Grasp", "grasped and put back", Operator.fly_grasp, judge_grasp, Operator.fly_grasp_once),
 }

@@ -157,6 +157,14 @@ class Plant:
         """
         self._data.mocap_pos[0] = mjcf.up(position_w)
 
+    def blow(self, wind_w: Sequence[float]) -> None:
+        """Let the wind blow like this from now on.
+
+        Args:
+            wind_w: m/s, NED.
+        """
+        self._wind = mjcf.up(wind_w)
+
     def push(self, force_w: Sequence[float]) -> None:
         """Push the airframe at its centre of mass until told otherwise.
 

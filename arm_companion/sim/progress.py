@@ -8,6 +8,7 @@ from typing import TextIO
 from rich.console import Console
 from rich.table import Table
 
+from arm_companion.sim.abort_verdict import AbortVerdict
 from arm_companion.sim.grasp_verdict import GraspVerdict
 from arm_companion.sim.trials import Outcome, Summary
 from arm_companion.sim.verdict import Verdict
@@ -61,6 +62,13 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
         )
     if isinstance(verdict, GraspVerdict):
         _show_grasp(verdict, table)
+    if isinstance(verdict, AbortVerdict):
+        for abort in verdict.aborts:
+            table.add_row(
+                f"abort in {abort.state}",
+                f"{abort.let_go_s:.1f} s" if abort.let_go_s else "no touch",
+                f"until the bar was let go; vehicle {_mm(abort.sank_m)} lower at most",
+            )
     console.print(table)
     style = "bold green" if verdict.success else "bold red"
     console.print(

@@ -36,9 +36,9 @@ class Operator:
 
     def __init__(self, link: OperatorLink, config: Config, flight: Flight, say: Say) -> None:
         self._link = link
-        self._config = config
+        self.config = config
         self._flight = flight
-        self._say = say
+        self.say = say
         self._arm = (1, config.vehicle.component_id)
         self._autopilot = (1, 1)
         link.watch(self._see)
@@ -52,7 +52,7 @@ class Operator:
             case "ARM_STATUS":
                 if not flight.states or flight.states[-1][1] != message.state_name:
                     flight.states.append((t, message.state_name))
-                    self._say(f"state {message.state_name}")
+                    self.say(f"state {message.state_name}")
             case "ARM_REACTION_WRENCH":
                 flight.wrenches.append(
                     WrenchSeen(
@@ -71,34 +71,41 @@ class Operator:
             case "STATUSTEXT":
                 flight.texts.append((t, message.text))
                 if message.severity <= mav.MAV_SEVERITY_WARNING:
-                    self._say(f"“{message.text}”")
+                    self.say(f"“{message.text}”")
 
-    def _state(self) -> str:
+    @property
+    def state(self) -> str:
+        """The arm's, as last told; empty before the first."""
         return self._flight.states[-1][1] if self._flight.states else ""
 
     # --- what is done ---
 
     async def fly_perch(self) -> str:
         """The whole flight. Returns why it failed, or an empty string."""
-        return await self._fly(self._perch, self._pull, self._release)
+        return await self.fly(self.perch, self._pull, self.release)
 
     async def fly_hang(self) -> str:
         """The same with a hang perch: the vehicle hangs for a while, takes its load back and leaves."""
-        return await self._fly(self._hang, self._release)
+        return await self.fly(self._hang, self.release)
 
     async def fly_hang_disarmed(self) -> str:
         """A person disarms the hanging vehicle, arms it again, gives it back and has it leave."""
-        return await self._fly(self._hang, self._disarm_and_arm, self._release)
+        return await self.fly(self._hang, self._disarm_and_arm, self.release)
 
     async def fly_grasp(self) -> str:
         """An object is picked up twice, without and with the feed-forward, and put back each time."""
-        return await self._fly(self._grasp_uncompensated, self._ready, self._grasp)
+        return await self.fly(self._grasp_uncompensated, self.ready, self._grasp)
 
     async def fly_grasp_once(self) -> str:
         """The same with the feed-forward alone, for trials."""
-        return await self._fly(self._grasp)
+        return await self.fly(self._grasp)
 
-    async def _fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
+    async def fly(self, *acts: Callable[[], Coroutine[Any, Any, None]]) -> str:
+        """Take off, do one act after the other until one fails, and come home whatever came before.
+
+        Returns:
+            Why it failed, or an empty string.
+        """
         failure = ""
         try:
             await self._prepare()
@@ -107,7 +114,7 @@ class Operator:
                 await act()
         except (ScenarioFailed, TimeoutError) as error:
             failure = str(error) or "the operator waited too long"
-            self._say(f"failed: {failure}")
+            self.say(f"failed: {failure}")
         try:
             await self._come_home()
         except (ScenarioFailed, TimeoutError) as error:
@@ -116,16 +123,16 @@ class Operator:
         return failure
 
     async def _prepare(self) -> None:
-        self._say("waiting for autopilot and arm")
-        await self._wait(lambda: self._heard(self._autopilot), 30.0, "no heartbeat from the autopilot")
-        await self._wait(lambda: self._heard(self._arm), 15.0, "no heartbeat from the arm")
-        await self._wait(lambda: self._state() == "STOWED", 10.0, "the arm is not stowed")
+        self.say("waiting for autopilot and arm")
+        await self.wait(lambda: self._heard(self._autopilot), 30.0, "no heartbeat from the autopilot")
+        await self.wait(lambda: self._heard(self._arm), 15.0, "no heartbeat from the arm")
+        await self.wait(lambda: self.state == "STOWED", 10.0, "the arm is not stowed")
 
     async def _take_off(self) -> None:
-        self._say("arm made ready, vehicle takes off")
-        await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
+        self.say("arm made ready, vehicle takes off")
+        await self.order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
         await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=60.0)
-        height = self._config.sim.takeoff_height_m
+        height = self.config.sim.takeoff_height_m
         if self._ardupilot:
             # it takes off by command in GUIDED only, PX4 in any mode but OFFBOARD; and it tells only what is asked
             await self._take_external_control()
@@ -137,42 +144,43 @@ class Operator:
             height if self._ardupilot else nan
         )  # PX4 takes it for one over the sea, and has a default of its own
         await self._vehicle(mav.MAV_CMD_NAV_TAKEOFF, [0, 0, 0, nan, nan, nan, over_home], "take-off")
-        await self._wait(lambda: abs(self._height() - height) < 0.15, 30.0, "the vehicle does not reach its height")
+        await self.wait(lambda: abs(self._height() - height) < 0.15, 30.0, "the vehicle does not reach its height")
         await asyncio.sleep(2.0)
         if not self._ardupilot:
             await self._take_external_control()
 
     async def _take_external_control(self) -> None:
-        self._say("external set-points on")
+        self.say("external set-points on")
         await self._vehicle(mav.MAV_CMD_DO_SET_MODE, [_CUSTOM_MODE, self._external_mode()], "mode change")
-        await self._wait(self._is_external, 5.0, "the autopilot does not take external set-points")
+        await self.wait(self._is_external, 5.0, "the autopilot does not take external set-points")
         # each port has heartbeats of its own, a second apart: the arm may know of it later than the ground
-        await self._wait(self._arm_may_fly, 5.0, "the arm does not see that it may fly the vehicle")
+        await self.wait(self._arm_may_fly, 5.0, "the arm does not see that it may fly the vehicle")
 
-    async def _perch(self) -> None:
-        self._say("PERCH")
-        await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
+    async def perch(self) -> None:
+        """Order an anchor perch, and wait until the arm has perched."""
+        self.say("PERCH")
+        await self.order(mav.MAV_CMD_ARM_PERCH, "PERCH", 120.0)
 
     async def _hang(self) -> None:
-        self._say("PERCH, to hang")
-        await self._order(mav.MAV_CMD_ARM_PERCH, "PERCH", 180.0, float(mav.ARM_PERCH_KIND_HANG))
+        self.say("PERCH, to hang")
+        await self.order(mav.MAV_CMD_ARM_PERCH, "PERCH", 180.0, float(mav.ARM_PERCH_KIND_HANG))
         start = asyncio.get_running_loop().time()
         await asyncio.sleep(_HANG_S)
         self._flight.marks.append(Mark("hang", start, asyncio.get_running_loop().time(), (0.0, 0.0, 0.0)))
-        if self._state() != "HANGING":
-            raise ScenarioFailed(f"the hanging ended by itself in {self._state()}")
+        if self.state != "HANGING":
+            raise ScenarioFailed(f"the hanging ended by itself in {self.state}")
 
     async def _disarm_and_arm(self) -> None:
-        self._say("disarmed by force")
+        self.say("disarmed by force")
         await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [0.0, _FORCE], "disarming")
-        await self._wait(lambda: self._state() == "HANG_HOLD", 5.0, "the arm does not notice that the motors stand")
+        await self.wait(lambda: self.state == "HANG_HOLD", 5.0, "the arm does not notice that the motors stand")
         await asyncio.sleep(_STANDS_S)
         await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming")
-        await self._order(mav.MAV_CMD_ARM_READY, "READY", 5.0)
+        await self.order(mav.MAV_CMD_ARM_READY, "READY", 5.0)
         if self._ardupilot:  # it ignores set-points until it has been told to take off
             await self._take_external_control()
             await self._vehicle(mav.MAV_CMD_NAV_TAKEOFF, [0.0] * 6 + [self._height() + 0.3], "take-off")
-            await self._wait(lambda: not self._landed(), 5.0, "the autopilot does not take off")
+            await self.wait(lambda: not self._landed(), 5.0, "the autopilot does not take off")
         else:
             await asyncio.sleep(_STREAM_S)
             await self._take_external_control()
@@ -187,12 +195,12 @@ class Operator:
         await self._compensate(on=False)
         await self._pull_to("pull x, not compensated", x)
         await self._compensate(on=True)
-        if self._state() != "PERCHED":
-            raise ScenarioFailed(f"the perch ended by itself in {self._state()}")
+        if self.state != "PERCHED":
+            raise ScenarioFailed(f"the perch ended by itself in {self.state}")
 
     async def _pull_to(self, name: str, move: Vec3) -> None:
         """One move away from where the vehicle rests, and back."""
-        self._say(f"{name}: 10 mm")
+        self.say(f"{name}: 10 mm")
         await self._jog(move)
         await asyncio.sleep(_PULL_S)
         await self._measure(name, move, _HOLD_S)
@@ -201,50 +209,64 @@ class Operator:
 
     async def _grasp(self) -> None:
         """Take the object, carry it for a while, and put it back."""
-        self._say("GRASP")
+        self.say("GRASP")
         await self._pick_and_place(WITH)
 
     async def _grasp_uncompensated(self) -> None:
-        self._say("GRASP, not compensated")
+        self.say("GRASP, not compensated")
         await self._compensate(on=False)
         await self._pick_and_place(WITHOUT)
         await self._compensate(on=True)
 
-    async def _ready(self) -> None:
-        await self._order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
+    async def ready(self) -> None:
+        """Order the arm to get ready, and wait until it is."""
+        await self.order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
 
     async def _pick_and_place(self, name: str) -> None:
         start = asyncio.get_running_loop().time()
-        await self._order(mav.MAV_CMD_ARM_GRASP, "GRASP", 150.0)
-        self._mark(name, start)
+        await self.order(mav.MAV_CMD_ARM_GRASP, "GRASP", 150.0)
+        self.mark(name, start)
         await asyncio.sleep(1.0)
         await self._measure(CARRIED, (0.0, 0.0, 0.0), _CARRY_S)
-        if self._state() != "CARRY":
-            raise ScenarioFailed(f"the carrying ended by itself in {self._state()}")
-        await self._release()
+        if self.state != "CARRY":
+            raise ScenarioFailed(f"the carrying ended by itself in {self.state}")
+        await self.release()
 
-    async def _release(self) -> None:
-        self._say("RELEASE")
-        await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
+    async def release(self) -> None:
+        """Order a release, and wait until the arm is stowed."""
+        self.say("RELEASE")
+        await self.order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
 
     async def _come_home(self) -> None:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
         quiet = ("STOWED", "READY", "HOLDING", "CARRY", "HANGING", "HANG_HOLD", "")
-        await self._wait(lambda: self._state() in quiet, 150.0, f"the arm stays in {self._state()}")
-        if self._state() in ("HOLDING", "CARRY", "HANGING", "HANG_HOLD"):
-            await self._order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
-        if self._state() == "READY":
-            await self._order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
-        self._say("landing")
+        await self.wait(lambda: self.state in quiet, 150.0, f"the arm stays in {self.state}")
+        if self.state in ("HOLDING", "CARRY", "HANGING", "HANG_HOLD"):
+            await self.order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
+        if self.state == "READY":
+            await self.order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
+        self.say("landing")
         await self._vehicle(mav.MAV_CMD_NAV_LAND, [0, 0, 0, float("nan"), float("nan"), float("nan"), 0], "landing")
-        await self._wait(lambda: not self._armed(), 60.0, "the vehicle does not land and disarm")
+        await self.wait(lambda: not self._armed(), 60.0, "the vehicle does not land and disarm")
 
     # --- small things ---
 
-    async def _order(self, command: int, name: str, timeout_s: float, first: float = 0.0) -> None:
-        result = await self._link.command(command, [first, *[0.0] * 6], target=self._arm, timeout=timeout_s)
+    async def order(self, command: int, name: str, timeout_s: float, *parameters: float) -> None:
+        """A command to the arm, until it is carried out.
+
+        Args:
+            command: MAV_CMD.
+            name: for people.
+            timeout_s: until the next sign of progress.
+            parameters: the first ones; the others are zero.
+
+        Raises:
+            ScenarioFailed: it was not carried out.
+        """
+        padded = [*parameters, *[0.0] * (7 - len(parameters))]
+        result = await self._link.command(command, padded, target=self._arm, timeout=timeout_s)
         if result != mav.MAV_RESULT_ACCEPTED:
             raise ScenarioFailed(f"{name}: {self._why(result)}")
 
@@ -254,16 +276,10 @@ class Operator:
         return f"{name} ({warnings[-1]})" if warnings else name
 
     async def _jog(self, move_w: Vec3) -> None:
-        parameters = [float(mav.ARM_JOG_KIND_VEHICLE), *move_w, 0.0, 0.0, 0.0]
-        result = await self._link.command(mav.MAV_CMD_ARM_JOG, parameters, target=self._arm, timeout=5.0)
-        if result != mav.MAV_RESULT_ACCEPTED:
-            raise ScenarioFailed(f"JOG: {self._why(result)}")
+        await self.order(mav.MAV_CMD_ARM_JOG, "JOG", 5.0, float(mav.ARM_JOG_KIND_VEHICLE), *move_w)
 
     async def _compensate(self, *, on: bool) -> None:
-        parameters = [float(on), *[0.0] * 6]
-        result = await self._link.command(mav.MAV_CMD_ARM_FEEDFORWARD, parameters, target=self._arm, timeout=5.0)
-        if result != mav.MAV_RESULT_ACCEPTED:
-            raise ScenarioFailed(f"FEEDFORWARD: {self._why(result)}")
+        await self.order(mav.MAV_CMD_ARM_FEEDFORWARD, "FEEDFORWARD", 5.0, float(on))
 
     async def _vehicle(self, command: int, parameters: list[float], what: str, retry_s: float = 0.0) -> None:
         """A command to the autopilot, repeated for `retry_s` while it is not ready yet."""
@@ -281,13 +297,18 @@ class Operator:
     async def _measure(self, name: str, asked_w: Vec3, seconds: float) -> None:
         start = asyncio.get_running_loop().time()
         await asyncio.sleep(seconds)
-        self._mark(name, start, asked_w)
+        self.mark(name, start, asked_w)
 
-    def _mark(self, name: str, start: float, asked_w: Vec3 = (0.0, 0.0, 0.0)) -> None:
+    def mark(self, name: str, start: float, asked_w: Vec3 = (0.0, 0.0, 0.0)) -> None:
         """Note what was asked from loop time `start` until now."""
         self._flight.marks.append(Mark(name, start, asyncio.get_running_loop().time(), asked_w))
 
-    async def _wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+    async def wait(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
+        """Wait until something holds.
+
+        Raises:
+            ScenarioFailed: with `otherwise`, when it did not within `timeout_s`.
+        """
         try:
             async with asyncio.timeout(timeout_s):
                 while not condition():
@@ -315,7 +336,7 @@ class Operator:
 
     @property
     def _ardupilot(self) -> bool:
-        return self._config.vehicle.autopilot == "ardupilot"
+        return self.config.vehicle.autopilot == "ardupilot"
 
     def _external_mode(self) -> float:
         return float(_GUIDED if self._ardupilot else _OFFBOARD)

@@ -18,6 +18,7 @@ from arm_companion.sim.autopilot import AutopilotStandIn
 from arm_companion.sim.plant import Plant, Pose
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
 from arm_companion.sim.servo_emulator import ServoEmulator
+from arm_companion.sim.wind import Wind
 from arm_companion.transport.base import Opener
 
 _SAMPLE_PERIOD_S = 0.04
@@ -70,6 +71,7 @@ class World:
     def __init__(self, config: Config, flown_by: FlightStack | None = None) -> None:
         self._config = config
         self.plant = Plant(config)
+        self.wind = Wind(config.sim.wind_m_per_s, config.sim.gust_m_per_s, config.sim.seed)
         self.flown_by: FlightStack = flown_by or AutopilotStandIn(config, config.vehicle.autopilot)
         self._period_s = self.flown_by.period_s
         self.servos = ServoEmulator(config.servos, config.sim.seed)
@@ -126,6 +128,7 @@ class World:
         while self.events and self.events[0][0] <= self.plant.time:
             self.events.pop(0)[1](self)
         config, period = self._config, self._period_s
+        self.plant.blow(self.wind.at(self.plant.time))
         rotors = self.flown_by.control(self.plant.state(), period)
         radius = config.arm.pulley_radius_m
         tensions = self.plant.tensions()

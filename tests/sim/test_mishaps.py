@@ -1,0 +1,120 @@
+"""Gusts, and perches that are taken back: the wind itself, the verdict on aborts, and the flights."""
+
+import math
+from itertools import pairwise
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from arm_companion.clock import run_simulated
+from arm_companion.config import load
+from arm_companion.sim.abort_verdict import LET_GO_WITHIN_S, judge_aborts
+from arm_companion.sim.flight import Flight, Mark
+from arm_companion.sim.mishaps import ABORTED_IN, fly_aborts, fly_in_gusts, fly_one_abort
+from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
+from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.verdict import judge
+from arm_companion.sim.wind import Wind
+from arm_companion.sim.world import Sample, World
+
+STEADY = (1.0, -0.5, 0.2)
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0)
+
+
+def strength(wind: tuple[float, float, float]) -> float:
+    return math.dist(wind, STEADY)
+
+
+@given(st.integers(0, 1000), st.floats(0.1, 10.0))
+def test_gusts_come_and_go_level_and_smooth_and_never_exceed_their_peak(seed: int, peak: float) -> None:
+    wind, step = Wind(STEADY, peak, seed), 0.02
+    seen = [wind.at(i * step) for i in range(3000)]
+    blown = [strength(w) for w in seen]
+    assert max(blown) <= peak + 1e-9
+    assert max(blown) > 0.3 * peak, "a minute has several gusts"
+    assert min(blown) == 0.0, "and pauses"
+    assert all(w[2] == STEADY[2] for w in seen)
+    # the steepest gust is the shortest: peak pi / length
+    assert max(abs(b - a) for a, b in pairwise(blown)) <= peak * math.pi / 0.8 * step + 1e-9
+
+
+def test_the_wind_is_drawn_from_its_seed_and_is_steady_without_gusts() -> None:
+    def blow(gust: float, seed: int) -> list[tuple[float, float, float]]:
+        wind = Wind(STEADY, gust, seed)
+        return [wind.at(0.1 * i) for i in range(300)]
+
+    assert blow(3.0, 7) == blow(3.0, 7) != blow(3.0, 8)
+    assert set(blow(0.0, 7)) == {STEADY}
+
+
+def test_a_gust_pushes_the_vehicle_in_the_plant() -> None:
+    config = load("sim.toml", ("sim.gust_m_per_s=8.0",))
+    world = World(config)
+    hover = RotorCommand(config.vehicle.mass_kg * 9.81, ZERO)
+    pushed = []
+    for _ in range(5000):
+        world.plant.blow(world.wind.at(world.plant.time))
+        world.plant.step(hover, (0.0,) * 4)
+        pushed.append(math.hypot(*world.plant.state().velocity_w[:2]))
+    assert max(pushed) > 0.2
+
+
+def sample(t: float, touch: float = 0.0, down: float = -2.0, sinking: float = 0.0) -> Sample:
+    state = RigidState((0.0, 0.0, down), (0.0, 0.0, sinking), LEVEL, ZERO, (0.0, 0.0, -9.81))
+    truth = PlantTruth(ZERO, ZERO, touch, ZERO, 0.0, (4.0,) * 4, ZERO, body_contact=False, rotor_contact=False)
+    return Sample(t, state, truth)
+
+
+def aborted(touch_until: float, *, falls: bool = False) -> Flight:
+    """An abort at 10 s; afterwards the vehicle lands."""
+    samples = [sample(0.1 * i, touch=5.0 if 0.1 * i < 10.0 + touch_until else 0.0) for i in range(600)]
+    if falls:
+        samples[120] = sample(12.0, down=-1.0, sinking=2.0)
+    samples += [sample(60.0 + 0.1 * i, down=0.0) for i in range(20)]
+    marks = [Mark("WRAP", 10.0, 40.0, ZERO)]
+    return Flight(samples, [(0.0, "WRAP"), (10.0, "UNLOAD"), (30.0, "STOWED")], marks=marks, end=62.0)
+
+
+def test_the_verdict_on_an_abort_is_the_plants() -> None:
+    good = judge_aborts(aborted(6.0), "")
+    assert good.success, good.reason
+    assert good.aborts[0].let_go_s == pytest.approx(6.0, abs=0.11)
+    late = judge_aborts(aborted(LET_GO_WITHIN_S + 1.0), "")
+    assert not late.success
+    assert "still touched the bar" in late.reason
+    fell = judge_aborts(aborted(6.0, falls=True), "")
+    assert "fell by 1.00 m" in fell.reason
+    assert not judge_aborts(Flight(aborted(6.0).samples, [(0.0, "STOWED")], end=62.0), "").success
+    assert "no answer" in judge_aborts(aborted(6.0), "no answer").reason
+
+
+@pytest.mark.scenario
+def test_a_perch_that_is_aborted_lets_go_in_whatever_state_it_is() -> None:
+    config = load("sim.toml")
+    result = run_simulated(fly_simulated(config, lambda _: None, fly=fly_aborts))
+    verdict = judge_aborts(result.flight, result.failure)
+    assert verdict.success, verdict.reason
+    assert [abort.state for abort in verdict.aborts] == list(ABORTED_IN)
+    touched = {abort.state for abort in verdict.aborts if abort.let_go_s > 0.0}
+    assert {"VERIFY", "PERCHED"} <= touched
+    assert "APPROACH" not in touched
+
+
+def test_an_abort_in_mid_air_ends_at_home() -> None:
+    config = load("sim.toml", ("sim.seed=6",))
+    assert ABORTED_IN[6 % len(ABORTED_IN)] == "APPROACH"
+    result = run_simulated(fly_simulated(config, lambda _: None, fly=fly_one_abort))
+    verdict = judge_aborts(result.flight, result.failure)
+    assert verdict.success, verdict.reason
+    assert [(a.state, a.let_go_s) for a in verdict.aborts] == [("APPROACH", 0.0)]
+
+
+@pytest.mark.scenario
+def test_a_vehicle_perches_in_gusts_and_stays_perched_in_them() -> None:
+    config = load("sim_gust.toml")
+    result = run_simulated(fly_simulated(config, lambda _: None, fly=fly_in_gusts))
+    verdict = judge(result.flight, result.failure)
+    assert verdict.success, verdict.reason
+    assert max(max(s.truth.tension) for s in result.flight.samples) < 1.05 * config.limits.tension_max_n
