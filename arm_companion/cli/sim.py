@@ -24,6 +24,10 @@ _CONFIGS = {
     "gust": "sim_gust.toml",
     "world": "sim.toml",
 }
+TOO_SLOW = 75
+"""Exit code of a flight that failed on a machine that could not keep up with real time (EX_TEMPFAIL)."""
+
+_LOST_S = 0.2  # the vehicle's state is stale after a quarter of a second
 _FILMS = (".mp4", ".mkv", ".webm", ".gif")
 
 
@@ -190,6 +194,13 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     if arguments.json:
         wall = time.perf_counter() - started
         print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
+    if not verdict.success and result.lost_s > _LOST_S:
+        print(
+            f"arm-companion sim: no fair flight: this machine fell {result.lost_s:.1f} s behind real time; "
+            "--simulated takes the time that it takes",
+            file=sys.stderr,
+        )
+        return TOO_SLOW
     return 0 if verdict.success and filmed else 1
 
 
@@ -302,6 +313,7 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],
         "cycles": result.cycles,
         "missed_cycles": result.missed,
+        "lost_s": round(result.lost_s, 3),
         "wall_s": round(wall_s, 3),
         "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
     }

@@ -97,7 +97,7 @@ class ServoRecord:
     firmware: int = 0  # 0: not known yet
     vouched: bool = False  # its LED says that its turns are known
     _tick_ms: int = 0
-    _tick_at: float = -math.inf
+    _tick_between: tuple[float, float] = (-math.inf, -math.inf)  # when it was asked for, and when it came
 
     def take(self, feedback: Feedback, now: float) -> None:
         """Note an answer. A position that no motion explains marks the turns as lost."""
@@ -110,18 +110,28 @@ class ServoRecord:
         self.missed = 0
         self.counters.answers += 1
 
-    def take_echo(self, echo: Echo, now: float) -> None:
-        """Compare what the servo has with what it was sent, and its clock with ours."""
+    def take_echo(self, echo: Echo, asked: float, now: float) -> None:
+        """Compare what the servo has with what it was sent, and its clock with ours.
+
+        The servo read its clock at some time between the question and its answer, which a stall of this process may
+        set far apart: only a clock that fits no such time has started afresh.
+
+        Args:
+            echo: the answer.
+            asked: time of the question, s.
+            now: time of the answer, s.
+        """
         self.goal_confirmed = echo.goal == self.goal
         self.goal_lost = self.torque and self.goal is not None and not self.goal_confirmed
         self.counters.goals_lost += self.goal_lost
-        elapsed = now - self._tick_at
-        if elapsed < _CLOCK_MEMORY_S:
-            off = (echo.tick_ms - self._tick_ms - elapsed * 1000) % TICK_CLOCK_MODULUS_MS
+        before = self._tick_between
+        least, most = asked - before[1], now - before[0]
+        if most < _CLOCK_MEMORY_S:
+            off = (echo.tick_ms - self._tick_ms - 500 * (least + most)) % TICK_CLOCK_MODULUS_MS
             off = min(off, TICK_CLOCK_MODULUS_MS - off)
-            if off > _CLOCK_TOLERANCE_MS + _CLOCK_DRIFT * 1000 * elapsed:
+            if off > _CLOCK_TOLERANCE_MS + 500 * (most - least) + _CLOCK_DRIFT * 1000 * most:
                 self.lose_power()
-        self._tick_ms, self._tick_at = echo.tick_ms, now
+        self._tick_ms, self._tick_between = echo.tick_ms, (asked, now)
 
     def rebase(self, position: int) -> None:
         """The servo counts its ticks from elsewhere now, and stands at `position`."""
@@ -154,7 +164,7 @@ class ServoRecord:
         self.tripped = False
         self.goal = None
         self.goal_lost = False
-        self._tick_at = -math.inf
+        self._tick_between = (-math.inf, -math.inf)
 
     def state(self, now: float, silent_after: int) -> ServoState:
         """The servo's state for the rest of the daemon."""

@@ -125,10 +125,11 @@ class ServoReader:
 
     async def _explain_gap(self, record: ServoRecord, deadline: float) -> bool:
         """Find out whether a servo that was not heard for a while lost power or was stopped meanwhile."""
+        asked = asyncio.get_running_loop().time()
         answers = await self._ask_one(record, *_RAM, deadline)
         if record.id not in answers:
             return False
-        self._explained_at[record.id] = asyncio.get_running_loop().time()
+        now = self._explained_at[record.id] = asyncio.get_running_loop().time()
         record.missed = 1  # it belongs to the next Sync Read again
         ram = answers[record.id].parameters
         at = ct.PROFILE_VELOCITY.address - _RAM[0]
@@ -136,7 +137,7 @@ class ServoReader:
             record.lose_power()
             return True
         record.take_watchdog(tripped=ct.BUS_WATCHDOG.decode(ram[:1]) == ct.WATCHDOG_TRIPPED)
-        record.take_echo(ct.decode_echo(ram[_ECHO[0] - _RAM[0] :]), asyncio.get_running_loop().time())
+        record.take_echo(ct.decode_echo(ram[_ECHO[0] - _RAM[0] :]), asked, now)
         return True
 
     async def check_torque(self, records: Sequence[ServoRecord], deadline: float) -> None:
@@ -152,8 +153,10 @@ class ServoReader:
 
     async def check_goals(self, records: Sequence[ServoRecord], deadline: float) -> None:
         """Look up which goals servos really have, and compare their clocks with ours."""
+        now = asyncio.get_running_loop().time
+        asked = now()
         for record, data in await self._look_up(records, *_ECHO, deadline):
-            record.take_echo(ct.decode_echo(data), asyncio.get_running_loop().time())
+            record.take_echo(ct.decode_echo(data), asked, now())
 
     async def _look_up(
         self, records: Sequence[ServoRecord], address: int, size: int, deadline: float

@@ -44,6 +44,7 @@ class Result:
     failure: str
     cycles: int = 0
     missed: int = 0
+    lost_s: float = 0.0  # real time that the physics could not keep up with
     poses: list[Pose] = dataclasses.field(default_factory=list)
     records: list[Record] = dataclasses.field(default_factory=list)
 
@@ -61,6 +62,7 @@ async def fly_simulated(
     world: Config | None = None,
     fly: Script = Operator.fly_perch,
     flown_by: FlightStack | None = None,
+    latency_s: float = 0.0002,
 ) -> Result:
     """One flight on the running simulated loop: every part in this process, over in-memory pipes.
 
@@ -72,8 +74,9 @@ async def fly_simulated(
         world: how the world is, where it differs from what the daemon believes.
         fly: the operator's script.
         flown_by: a flight stack in place of the stand-in.
+        latency_s: of the line between autopilot and daemon, each way.
     """
-    companion, ground, arm, servos = MemoryPipe(), MemoryPipe(), MemoryPipe(), MemoryPipe()
+    companion, ground, arm, servos = MemoryPipe(latency_s), MemoryPipe(), MemoryPipe(), MemoryPipe()
     plant = World(config if world is None else world, flown_by)
     prepare(plant)
     clock = Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S)
@@ -101,7 +104,7 @@ async def fly_simulated(
         failure = await fly(Operator(link, config, flight, say))
         stop.set()
         await asyncio.sleep(0.5)
-    return Result(flight, failure, daemon.cycles, daemon.missed, plant.poses, memory.records)
+    return Result(flight, failure, daemon.cycles, daemon.missed, poses=plant.poses, records=memory.records)
 
 
 def _model(config: Config) -> RodModel:
@@ -151,7 +154,7 @@ async def fly_real_time(
         failure = operator.result()
     if world.lost_s > 0.0:
         say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
-    return Result(flight, failure, poses=world.poses)
+    return Result(flight, failure, lost_s=world.lost_s, poses=world.poses)
 
 
 async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, stop: asyncio.Event) -> None:

@@ -6,6 +6,7 @@ to as soon as the torque comes on.
 """
 
 import random
+from collections.abc import Callable
 from functools import cache
 
 from arm_companion.protocol import control_table as ct
@@ -56,7 +57,7 @@ class EmulatedServo:
     Attributes:
         values: raw value of every register, by address.
         motor: the horn's true motion, which no loss of power changes.
-        lag_s: by how much its time, as `advance` counts it, is behind the world's clock; its own clock is not.
+        lag: tells by how much its time, as `advance` counts it, is behind the world's clock, s; its own clock is not.
         silenced: its transmitter is broken: it obeys and does not answer.
     """
 
@@ -64,7 +65,7 @@ class EmulatedServo:
         self.values = {address: register.initial for address, register in ct.REGISTERS.items()}
         self.motor = Motor(position)
         self.silenced = False
-        self.lag_s = 0.0
+        self.lag: Callable[[], float] = lambda: 0.0
         self._rng = rng
         self._trajectory = Trajectory(position)
         self._turns = 0.0  # ticks from the horn's true position to the reported one
@@ -342,7 +343,7 @@ class EmulatedServo:
         v[ct.MOVING_STATUS.address] = self._moving_status(position)
 
     def _tick(self) -> int:
-        return int((self._clock + self.lag_s - self._booted_at) * 1000) % ct.TICK_CLOCK_MODULUS_MS
+        return int((self._clock + self.lag() - self._booted_at) * 1000) % ct.TICK_CLOCK_MODULUS_MS
 
     def _moving(self) -> bool:
         threshold = self.values[ct.MOVING_THRESHOLD.address] * ct.VELOCITY_UNIT_RAD_PER_S
@@ -372,7 +373,7 @@ class EmulatedServo:
                 self.values[address] = register.initial
         self.values[ct.GOAL_PWM.address] = self.values[ct.PWM_LIMIT.address]
         self._registered = None
-        self._booted_at = self._heard_at = self._clock
+        self._booted_at, self._heard_at = self._clock + self.lag(), self._clock
         self._strained_s = 0.0
         self.motor.release()
         self._forget_turns()

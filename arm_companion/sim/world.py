@@ -104,6 +104,9 @@ class World:
         start = loop.time()
         period, periods = self._period_s, 0
         most, sampled = round(_IN_ONE_GO_S / period), round(_SAMPLE_PERIOD_S / period)
+        for servo in self.servos.servos:
+            # asked for afresh: after a stall servos answer before they have caught up
+            servo.lag = lambda: loop.time() - start - periods * period
         async for tick in ticks(period):
             lag = tick.now - start - self.lost_s - periods * period
             if lag > _MOST_BEHIND_S:  # the machine stalled: this time is lost
@@ -118,8 +121,6 @@ class World:
                 if periods % sampled == 0:
                     asked = self.flown_by.asked_w
                     self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth(), asked))
-            for servo in self.servos.servos:
-                servo.lag_s = loop.time() - start - periods * period
 
     def _advance(self) -> None:
         """One control period."""

@@ -1,19 +1,23 @@
 """Gusts, and perches that are taken back: the wind itself, the verdict on aborts, and the flights."""
 
+import json
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from arm_companion.__main__ import main
+from arm_companion.cli import sim as cli
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.sim.abort_verdict import LET_GO_WITHIN_S, judge_aborts
 from arm_companion.sim.flight import Flight, Mark
 from arm_companion.sim.mishaps import ABORTED_IN, fly_aborts, fly_in_gusts, fly_one_abort
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
-from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.verdict import judge
 from arm_companion.sim.wind import Wind
 from arm_companion.sim.world import Sample, World
@@ -88,6 +92,18 @@ def test_the_verdict_on_an_abort_is_the_plants() -> None:
     assert "fell by 1.00 m" in fell.reason
     assert not judge_aborts(Flight(aborted(6.0).samples, [(0.0, "STOWED")], end=62.0), "").success
     assert "no answer" in judge_aborts(aborted(6.0), "no answer").reason
+
+
+@pytest.mark.parametrize(("lost_s", "code"), [(0.0, 1), (0.1, 1), (3.0, cli.TOO_SLOW)])
+def test_a_failure_on_a_machine_that_fell_behind_has_an_exit_code_of_its_own(
+    lost_s: float, code: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flown = Result(aborted(6.0), "", lost_s=lost_s)  # it never perched
+    monkeypatch.setattr(cli, "_real_time", lambda *_: flown)
+    assert main(["sim", "perch", "--output", str(tmp_path), "--json"]) == code
+    said = capsys.readouterr()
+    assert ("fell 3.0 s behind real time" in said.err) is (code == cli.TOO_SLOW)
+    assert json.loads(said.out.splitlines()[-1])["lost_s"] == lost_s
 
 
 @pytest.mark.scenario
