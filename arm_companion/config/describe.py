@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from arm_companion.config.options import Option, describe
 from arm_companion.config.schema import Config
+from arm_companion.config.table import as_table
 
 NAME: Final = "NAME"
 """Stands in a key for a name that the user chooses, as in `links.NAME.url`."""
@@ -91,7 +92,7 @@ def _object(cls: Any) -> dict[str, Any]:
         if default is dataclasses.MISSING:
             required.append(f.name)
         elif default is not None:
-            properties[f.name]["default"] = _plain(default)
+            properties[f.name]["default"] = as_table(default)
     body: dict[str, Any] = {"type": "object", "additionalProperties": False, "properties": properties}
     if cls.__doc__:
         body["description"] = cls.__doc__.strip().partition("\n")[0]
@@ -168,9 +169,3 @@ def _default(f: "dataclasses.Field[Any]") -> Any:
     if f.default is not dataclasses.MISSING:
         return f.default
     return f.default_factory() if f.default_factory is not dataclasses.MISSING else dataclasses.MISSING
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value
