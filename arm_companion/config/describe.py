@@ -53,8 +53,20 @@ class Described:
 
     def fits(self, key: str) -> bool:
         """Whether a dotted key with real names means this option."""
-        mine, theirs = self.key.replace("[]", "").split("."), key.split("[", maxsplit=1)[0].split(".")
-        return len(mine) == len(theirs) and all(a in (b, NAME) for a, b in zip(mine, theirs, strict=True))
+        theirs = key.split("[", maxsplit=1)[0].split(".")
+        return len(self._parts) == len(theirs) and self._begins_with(theirs)
+
+    def is_below(self, section: str) -> bool:
+        """Whether this option stands in a section, which may have real names in it, as `links.ground`."""
+        theirs = section.split(".")
+        return len(self._parts) > len(theirs) and self._begins_with(theirs)
+
+    @property
+    def _parts(self) -> list[str]:
+        return self.key.replace("[]", "").split(".")
+
+    def _begins_with(self, parts: list[str]) -> bool:
+        return all(mine in (theirs, NAME) for mine, theirs in zip(self._parts, parts, strict=False))
 
 
 def every(cls: Any = Config, path: str = "") -> Iterator[Described]:
