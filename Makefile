@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# what has a target of its own
+SHORT := not scenario and not soak and not sitl
 
 .PHONY: help setup demo test scenarios sitl soak check bench docs deb format clean
 .DEFAULT_GOAL := help
@@ -24,8 +26,8 @@ demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated 
 	@$(BIN)/arm-companion sim perch --output build/demo
 
 test: $(STAMP)  ## run the tests: what has its own time on all cores, then what runs against the wall clock alone
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak and not sitl'
-	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak and not sitl'
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and $(SHORT)'
+	@$(BIN)/python -m pytest -m 'realtime and $(SHORT)'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and install the Debian package
 	@$(BIN)/python -m pytest -n auto --dist load -m scenario
