@@ -89,7 +89,7 @@ def _explain(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"there is no option '{arguments.key}'{hint}")
     layers = _layers(arguments)
     config = as_table(checked(layers))
-    told = [_tell(option, key if option.fits(key) else option.key, config, layers) for option in found]
+    told = [_tell(option, key if option.fits(key) else option.within(key), config, layers) for option in found]
     if arguments.json:
         print(json.dumps(told, indent=2))
         return

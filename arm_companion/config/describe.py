@@ -61,6 +61,13 @@ class Described:
         theirs = section.split(".")
         return len(self._parts) > len(theirs) and self._begins_with(theirs)
 
+    def within(self, section: str) -> str:
+        """The key, with the real names of a section that it stands in."""
+        theirs = section.split(".")
+        mine = self.key.split(".")
+        named = [real if part == NAME else part for part, real in zip(mine, theirs, strict=False)]
+        return ".".join([*named, *mine[len(named) :]])
+
     @property
     def _parts(self) -> list[str]:
         return self.key.replace("[]", "").split(".")
