@@ -54,8 +54,8 @@ docs: $(STAMP)  ## build the documentation in build/docs, and check its links
 	@$(BIN)/python -m sphinx -b html -q -W --keep-going docs build/docs
 	@echo "build/docs/index.html"
 
-deb:  ## build a Debian package of the daemon for this machine, in build
-	@systemd/deb.sh --output build
+deb:  ## build a Debian package of the daemon in build, for this machine or with ARCH=arm64
+	@systemd/deb.sh --output build $(if $(ARCH),--arch $(ARCH))
 
 format: $(STAMP)  ## apply the formatter and the safe fixes
 	@$(BIN)/ruff check --fix .
