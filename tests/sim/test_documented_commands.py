@@ -5,6 +5,7 @@
 
 import asyncio
 import contextlib
+import math
 import os
 import re
 import shutil
@@ -16,6 +17,8 @@ from pathlib import Path
 
 import pytest
 
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import load
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from tests.documentation import ALONE, BEGIN, COMMANDS, IN_A_WORLD, ON_A_BUS, ROOT, group, words_of
@@ -48,6 +51,19 @@ def program(page: str, says: str) -> str:
     return found
 
 
+def loading_test() -> str:
+    """What a person would measure at the default arm: the tip under loads, in three bends."""
+    rows = ["run,theta_deg,force_x_n,x_m,y_m,z_m"]
+    model = RodModel(ArmParameters.of(load("zhao2022.toml").arm))
+    for degrees in (0.0, 20.0, 40.0):
+        pull = model.pull_for_bend([math.radians(degrees), 0.0])
+        for force in (0.0, 0.2, 0.4, 0.6):
+            found = model.free(pull, [0.0, 0.0, 9.81], tip_wrench=[force, 0.0, 0.0, 0.0, 0.0, 0.0])
+            x, y, z = found.tip_position
+            rows.append(f"bend {degrees:g},{degrees},{force},{x:.5f},{y:.5f},{z:.5f}")
+    return "\n".join(rows) + "\n"
+
+
 def run(words: list[str], folder: Path, within_s: float = LONG_S) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run(
@@ -77,8 +93,8 @@ def place(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("line", lines(ALONE), ids=lambda line: line[:60])
 def test_it_runs(line: str, place: Path) -> None:
     if line.startswith("calibrate stiffness"):
-        run(command("model stiffness-test --csv DATA.csv"), place)
         (place / "arm.toml").unlink()
+        (place / "DATA.csv").write_text(loading_test())
     words = command(line)
     if "--trials" in words:
         words[words.index("--trials") + 1] = "1"
@@ -96,15 +112,15 @@ def test_it_runs(line: str, place: Path) -> None:
 
 
 @contextlib.contextmanager
-def world(folder: Path) -> Iterator["subprocess.Popen[str]"]:
-    """`arm-companion sim world`, as the pages start it."""
-    started = subprocess.Popen(
-        [sys.executable, "-m", "arm_companion", "sim", "world"],
-        cwd=folder, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-        text=True,
-    )  # fmt: skip
+def world(folder: Path, line: str = "sim world") -> Iterator[None]:
+    """`arm-companion sim world`, as the pages start it, and heard."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    started = subprocess.Popen(command(line), cwd=folder, env=environment, stdout=subprocess.DEVNULL)
     try:
-        yield started
+        for _ in range(5):  # each waits until it hears the arm, or gives up
+            if run(command("ground status"), folder, 60.0).returncode == 0:
+                break
+        yield
     finally:
         started.send_signal(signal.SIGINT)
         started.wait(20.0)
@@ -137,6 +153,32 @@ def test_a_reader_with_a_world_on_the_desk(place: Path) -> None:
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
     assert "result 0" in done.stdout
     assert "N on the airframe" in done.stdout
+
+
+def _look(place: str) -> None:
+    """The world of vision.md, and the program beside it; called in a network of its own."""
+    folder = Path(place)
+    (line,) = (line for page, line in COMMANDS if page == "vision.md" and line.startswith("sim world"))
+    page = (ROOT / "docs/vision.md").read_text(encoding="utf-8")
+    (words,) = re.findall(r"^python (docs/examples/vision/.*)$", page, re.MULTILINE)
+    script, *options = words.split()
+    with world(folder, line):
+        before = run(command("ground status --json"), folder, 60.0)
+        seeing = ["timeout", "--preserve-status", "-s", "INT", "8", sys.executable, str(ROOT / script), *options]
+        assert run(seeing, folder, 60.0).returncode == 0
+        after = run(command("ground status --json"), folder, 60.0)
+    log = (folder / "build/sim/daemon.log").read_text()
+    sys.stdout.write(f"{before.stdout}{before.stderr}\n{after.stdout}{after.stderr}\n{log}")
+    assert "target_known" not in before.stdout
+    assert "target_known" in after.stdout
+    assert "refused" not in log
+
+
+@pytest.mark.realtime
+def test_a_reader_with_a_vision_process(place: Path) -> None:
+    here = "from tests.sim.test_documented_commands import _look; import sys; _look(sys.argv[1])"
+    done = run([sys.executable, "-c", _OWN_NETWORK, sys.executable, "-c", here, str(place)], ROOT, 300.0)
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
 
 
 @pytest.mark.realtime

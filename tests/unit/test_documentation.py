@@ -54,6 +54,12 @@ def test_the_page_of_all_commands_is_up_to_date(monkeypatch: pytest.MonkeyPatch)
     assert page == document.document(), "python -m arm_companion.cli.document > docs/cli.md"
 
 
+def test_every_test_that_a_page_names_is_there() -> None:
+    named = {path for page in PAGES for path in re.findall(r"tests/[\w/]+\.py", page.read_text(encoding="utf-8"))}
+    assert len(named) > 15
+    assert {path for path in named if not (ROOT / path).exists()} == set()
+
+
 def test_every_relative_link_leads_somewhere() -> None:
     for page in PAGES:
         for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
