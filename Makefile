@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
+# what has a target of its own
+SHORT := not scenario and not soak and not sitl
 
 .PHONY: help setup demo test scenarios sitl soak check bench docs deb format clean
 .DEFAULT_GOAL := help
@@ -26,8 +28,8 @@ demo: $(STAMP)  ## fly a whole perch with the real daemon against the simulated 
 		&& $(BIN)/arm-companion sim perch --simulated --output build/demo; }
 
 test: $(STAMP)  ## run the tests: what has its own time on all cores, then what runs against the wall clock alone
-	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and not scenario and not soak and not sitl'
-	@$(BIN)/python -m pytest -m 'realtime and not scenario and not soak and not sitl'
+	@$(BIN)/python -m pytest -n auto --dist loadfile -m 'not realtime and $(SHORT)'
+	@$(BIN)/python -m pytest -m 'realtime and $(SHORT)'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and install the Debian package
 	@$(BIN)/python -m pytest -n auto --dist load -m scenario
@@ -54,8 +56,8 @@ docs: $(STAMP)  ## build the documentation in build/docs, and check its links
 	@$(BIN)/python -m sphinx -b html -q -W --keep-going docs build/docs
 	@echo "build/docs/index.html"
 
-deb:  ## build a Debian package of the daemon for this machine, in build
-	@systemd/deb.sh --output build
+deb:  ## build a Debian package of the daemon in build, for this machine or with ARCH=arm64
+	@systemd/deb.sh --output build $(if $(ARCH),--arch $(ARCH))
 
 format: $(STAMP)  ## apply the formatter and the safe fixes
 	@$(BIN)/ruff check --fix .

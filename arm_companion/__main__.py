@@ -9,6 +9,7 @@ from collections.abc import Collection
 from arm_companion import __version__
 from arm_companion.errors import ArmError, ConfigError
 
+_INTERRUPTED = 130  # 128 + SIGINT, as shells count
 _COMMANDS = {
     "run": "the daemon: fly the arm",
     "ground": "hear and command the arm from the ground",
@@ -55,6 +56,9 @@ def main(argv: list[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except KeyboardInterrupt:  # what has an orderly end of its own takes the signal before it gets here
+        print("arm-companion: interrupted", file=sys.stderr)
+        return _INTERRUPTED
     except ConfigError as error:
         print(f"arm-companion: {error}", file=sys.stderr)
         return error.exit_code

@@ -26,6 +26,7 @@ from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.settings import Settings, state_directory
 from arm_companion.drivers.signing_keys import SigningKeys
 from arm_companion.drivers.standard_services import Power
+from arm_companion.drivers.system_status import in_trouble, system_status
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
@@ -340,6 +341,7 @@ class Daemon:
             log.log(_LEVELS[notice.severity], "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
+        self._component.status = system_status(commands.status, active=self._component.active)
         self._telemetry.holder = self._component.access.holder
         self._telemetry.publish(
             now,
@@ -359,6 +361,7 @@ class Daemon:
     async def _fall_back(self, tick: Tick) -> None:
         """The safe action after an exception: goals stay, and the vehicle is held where it was asked to be."""
         last = self._last
+        self._component.status = in_trouble(last.status if last is not None else None)
         try:
             if SAFE_ACTION[self._state.phase] is ArmAction.LIMP:
                 await self._bus.limp()

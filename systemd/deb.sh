@@ -1,5 +1,5 @@
 #!/bin/sh
-# Builds a Debian package of the daemon for the machine that it runs on: its virtual environment, unit, rules and
+# Builds a Debian package of the daemon, for this machine or another: its virtual environment, unit, rules and
 # configuration. The same tree as install.sh lays down, at the places that Debian gives to packages.
 set -eu
 
@@ -11,6 +11,7 @@ options:
   --output DIR     where the package goes (default: build)
   --extras LIST    extras of the package, such as fast,mqtt (default: record,mqtt)
   --python PYTHON  the interpreter of the system that the package is for (default: /usr/bin/python3)
+  --arch ARCH      the machine that the package is for: amd64 or arm64 (default: this one)
   --help           this text
 
 Prints the package's path. exit code: 0 done; 1 something failed; 2 wrong use
@@ -20,12 +21,12 @@ TEXT
 fail() { echo "deb.sh: $*" >&2; exit 1; }
 misuse() { echo "deb.sh: $*" >&2; usage >&2; exit 2; }
 
-OUTPUT=build EXTRAS=record,mqtt PYTHON=/usr/bin/python3
+OUTPUT=build EXTRAS=record,mqtt PYTHON=/usr/bin/python3 ARCHITECTURE=
 while [ $# -gt 0 ]; do
     case $1 in
-        --output | --extras | --python)
+        --output | --extras | --python | --arch)
             [ $# -gt 1 ] || misuse "$1 needs a value"
-            case $1 in --output) OUTPUT=$2 ;; --extras) EXTRAS=$2 ;; --python) PYTHON=$2 ;; esac
+            case $1 in --output) OUTPUT=$2 ;; --extras) EXTRAS=$2 ;; --python) PYTHON=$2 ;; --arch) ARCHITECTURE=$2 ;; esac
             shift ;;
         -h | --help) usage; exit 0 ;;
         *) misuse "unknown: $1" ;;
@@ -38,13 +39,20 @@ command -v dpkg-deb > /dev/null || fail "dpkg-deb is missing: this is no Debian"
 NAME=arm-companion
 SOURCE=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 VERSION=$(sed -n 's/^version = "\(.*\)"$/\1/p' "$SOURCE/pyproject.toml")
-ARCHITECTURE=$(dpkg --print-architecture)
+HERE=$(dpkg --print-architecture)
+case ${ARCHITECTURE:=$HERE} in
+    "$HERE") MACHINE= ;;
+    amd64) MACHINE=x86_64 ;;
+    arm64) MACHINE=aarch64 ;;
+    *) misuse "--arch $ARCHITECTURE: amd64 or arm64" ;;
+esac
 MINOR=$("$PYTHON" -c 'import sys; print(sys.version_info.minor)')
 TREE=$(mktemp -d)
 trap 'rm -rf "$TREE"' EXIT
 chmod 0755 "$TREE"
 
-"$SOURCE/systemd/install.sh" --root "$TREE" --source "$SOURCE" --extras "$EXTRAS" --python "$PYTHON" >&2
+"$SOURCE/systemd/install.sh" --root "$TREE" --source "$SOURCE" --extras "$EXTRAS" --python "$PYTHON" \
+    ${MACHINE:+--machine "$MACHINE"} >&2
 
 # from where an administrator puts things to where a package does; systemd makes what lies below /var by itself
 move() { mkdir -p "$TREE/$(dirname "$2")" && mv "$TREE/$1" "$TREE/$2"; }

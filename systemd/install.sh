@@ -16,6 +16,8 @@ options:
   --extras LIST    extras of the package, such as fast,mqtt (default: fast)
   --python PYTHON  the interpreter that the virtual environment is made with (default: python3)
   --root DIR       install below DIR, touching nothing else; DESTDIR does the same
+  --machine NAME   with --root: for another kind of machine, aarch64 or x86_64, from ready-made packages alone;
+                   --python is then one of the target's version, at the path that it has there
   --no-venv        leave the virtual environment alone
   --start          start the service at the end (and at each boot it starts anyway)
   --purge          with uninstall: configuration, state, logs and user go too
@@ -29,15 +31,16 @@ TEXT
 fail() { echo "install.sh: $*" >&2; exit 1; }
 misuse() { echo "install.sh: $*" >&2; usage >&2; exit 2; }
 
-ACTION=install ROOT=${DESTDIR:-} DRY= START= PURGE= VENV=yes EXTRAS=fast PYTHON=python3
+ACTION=install ROOT=${DESTDIR:-} DRY= START= PURGE= VENV=yes EXTRAS=fast PYTHON=python3 MACHINE=
 SOURCE=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 while [ $# -gt 0 ]; do
     case $1 in
         install | upgrade | uninstall) ACTION=$1 ;;
-        --source | --extras | --python | --root)
+        --source | --extras | --python | --root | --machine)
             [ $# -gt 1 ] || misuse "$1 needs a value"
             case $1 in
                 --source) SOURCE=$2 ;; --extras) EXTRAS=$2 ;; --python) PYTHON=$2 ;; --root) ROOT=$2 ;;
+                --machine) MACHINE=$2 ;;
             esac
             shift ;;
         --no-venv) VENV= ;;
@@ -54,6 +57,11 @@ case $ROOT in
     '' | /) ROOT= ;;
     /*) ROOT=${ROOT%/} ;;
     *) ROOT=$(pwd)/${ROOT%/} ;;
+esac
+case $MACHINE in
+    '') ;;
+    aarch64 | x86_64) [ -n "$ROOT" ] || misuse "--machine goes with --root" ;;
+    *) misuse "--machine $MACHINE: aarch64 or x86_64" ;;
 esac
 
 NAME=arm-companion
@@ -139,16 +147,47 @@ make_configuration() {
     fi
 }
 
+# Fill the virtual environment for a machine whose programs do not run here: nothing of it is run, or compiled.
+fill_for_another_machine() {
+    version=$("$PYTHON" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+    site=$PREFIX/venv/lib/python$version/site-packages
+    if [ -n "$DRY" ]; then
+        say would "pip install --only-binary=:all: --platform manylinux*_$MACHINE --target $site"
+        return 0
+    fi
+    scratch=$(mktemp -d)
+    "$PYTHON" -m venv "$scratch/venv"
+    pip() { "$scratch/venv/bin/python" -m pip --disable-pip-version-check --quiet "$@"; }
+    pip wheel --no-deps --wheel-dir "$scratch" "$SOURCE"
+    rm -rf "$site" && mkdir -p "$site"
+    wheel=$(echo "$scratch"/arm_companion-*.whl)
+    set -- --only-binary=:all: --python-version "$version" --target "$site" --no-compile
+    for libc in 2_17 2_24 2_26 2_27 2_28; do set -- "$@" --platform "manylinux_${libc}_$MACHINE"; done
+    pip install "$@" --platform "manylinux2014_$MACHINE" -c "$SOURCE/constraints.txt" "$wheel${EXTRAS:+[$EXTRAS]}"
+    rm -rf "$scratch" "$site/bin"
+    cat > "$PREFIX/venv/bin/$NAME" <<SCRIPT
+#!$PREFIX/venv/bin/python
+import sys
+from arm_companion.__main__ import main
+sys.exit(main())
+SCRIPT
+    chmod 0755 "$PREFIX/venv/bin/$NAME"
+}
+
 make_venv() {
     [ -n "$VENV" ] || { say skipped "$PREFIX/venv"; return 0; }
     "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))' || fail "$PYTHON is not Python 3.11 or newer"
     if [ ! -x "$PREFIX/venv/bin/python" ]; then
         say make "$PREFIX/venv"
-        do_ "$PYTHON" -m venv "$PREFIX/venv"
+        do_ "$PYTHON" -m venv ${MACHINE:+--without-pip} "$PREFIX/venv"
     fi
-    say install "$SOURCE${EXTRAS:+ [$EXTRAS]}"
-    do_ "$PREFIX/venv/bin/python" -m pip --disable-pip-version-check --quiet install --upgrade \
-        -c "$SOURCE/constraints.txt" "$SOURCE${EXTRAS:+[$EXTRAS]}"
+    say install "$SOURCE${EXTRAS:+ [$EXTRAS]}${MACHINE:+ for $MACHINE}"
+    if [ -n "$MACHINE" ]; then
+        fill_for_another_machine
+    else
+        do_ "$PREFIX/venv/bin/python" -m pip --disable-pip-version-check --quiet install --upgrade \
+            -c "$SOURCE/constraints.txt" "$SOURCE${EXTRAS:+[$EXTRAS]}"
+    fi
     if [ -n "$ROOT" ] && [ -z "$DRY" ]; then
         # scripts name their interpreter by its path, which is another once the tree stands where it belongs
         grep -lI "^#!$PREFIX" "$PREFIX/venv/bin/"* | while read -r script; do
@@ -197,7 +236,7 @@ install_() {
         if [ "$ACTION" = upgrade ]; then do_ systemctl try-restart $NAME; fi
         if [ -n "$START" ]; then do_ systemctl start $NAME; fi
     fi
-    say next "edit $ETC/config.toml, then: $NAME doctor --config $ETC/config.toml"
+    say next "edit $ETC/config.toml, then: $NAME doctor"
 }
 
 uninstall() {

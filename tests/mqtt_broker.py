@@ -1,10 +1,15 @@
-"""An MQTT broker for tests: 3.1.1 and 5, QoS 0 and 1, retained messages, wills; and it can behave badly."""
+"""An MQTT broker for tests: 3.1.1 and 5, QoS 0 and 1, retained messages, wills; and it can behave badly.
+
+What is published goes on to whoever has subscribed to it, with QoS 0.
+"""
 
 import asyncio
 import contextlib
 import struct
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field
+
+from paho.mqtt.client import topic_matches_sub
 
 CONNECT, PUBLISH, PUBACK, SUBSCRIBE, PING, DISCONNECT = 1, 3, 4, 8, 12, 14
 
@@ -60,10 +65,12 @@ class Broker:
 
     async def send(self, topic: str, payload: bytes, *, retain: bool = False) -> None:
         """To whoever has subscribed."""
-        for session in self.sessions:
-            if topic in session.filters:
-                session.writer.write(_publish(session, topic, payload, retain))
-                await session.writer.drain()
+        for session in self._subscribers(topic):
+            session.writer.write(_publish(session, topic, payload, retain))
+            await session.writer.drain()
+
+    def _subscribers(self, topic: str) -> list[Session]:
+        return [session for session in self.sessions if any(topic_matches_sub(f, topic) for f in session.filters)]
 
     async def _accept(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
@@ -141,6 +148,8 @@ class Broker:
         self.messages.append(message)
         if message.retain:
             self.retained[message.topic] = message.payload
+        for session in self._subscribers(message.topic):
+            session.writer.write(_publish(session, message.topic, message.payload, retain=False))
 
     def _subscribe(self, session: Session, body: bytes) -> None:
         rest = _skip_properties(body[2:]) if session.version == 5 else body[2:]
@@ -148,6 +157,9 @@ class Broker:
         session.filters.append(topic.decode())
         answer = body[:2] + (b"\x00" if session.version == 5 else b"") + b"\x01"
         session.writer.write(bytes([0x90, len(answer)]) + answer)
+        for known, payload in self.retained.items():
+            if topic_matches_sub(session.filters[-1], known):
+                session.writer.write(_publish(session, known, payload, retain=True))
 
 
 @contextlib.asynccontextmanager

@@ -10,6 +10,7 @@ from arm_companion.app import check_flyable, open_configured
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.config.describe import Described, every, json_schema
 from arm_companion.config.layers import Layers, collect
+from arm_companion.config.load import checked
 from arm_companion.config.options import spelling
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
@@ -51,15 +52,17 @@ def run(arguments: argparse.Namespace) -> int:
         case "show":
             print(json.dumps(as_table(load_from(arguments)), indent=2))
         case "check":
-            _check(load_from(arguments), arguments)
+            _check(arguments)
         case "explain":
             _explain(arguments)
     return 0
 
 
-def _check(config: Config, arguments: argparse.Namespace) -> None:
-    """Tell the layers of a configuration that was accepted, and whether it can fly too."""
-    for layer in _layers(arguments):
+def _check(arguments: argparse.Namespace) -> None:
+    """Tell the layers of a configuration that is accepted, and whether it can fly too."""
+    layers = _layers(arguments)
+    config = checked(layers)
+    for layer in layers:
         print(f"  {layer.path or layer.name}")
     try:
         open_configured(config)
@@ -78,14 +81,15 @@ def _explain(arguments: argparse.Namespace) -> None:
     key = ".".join(spelling(Config, arguments.key.split(".")))
     found = [option for option in every() if option.fits(key)]
     if not found:
-        found = [option for option in every() if _below(option, key)]
+        found = [option for option in every() if option.is_below(key)]
     if not found:
         known = [option.key for option in every()]
         close = difflib.get_close_matches(key, known, n=3) or [k for k in known if key.split(".")[-1] in k][:3]
         hint = f": did you mean {' or '.join(close)}?" if close else ""
         raise ConfigError(f"there is no option '{arguments.key}'{hint}")
-    config, layers = as_table(load_from(arguments)), _layers(arguments)
-    told = [_tell(option, key if option.fits(key) else option.key, config, layers) for option in found]
+    layers = _layers(arguments)
+    config = as_table(checked(layers))
+    told = [_tell(option, key if option.fits(key) else option.within(key), config, layers) for option in found]
     if arguments.json:
         print(json.dumps(told, indent=2))
         return
@@ -96,12 +100,6 @@ def _explain(arguments: argparse.Namespace) -> None:
         for name, value in fact.items():
             if value not in ("", None):
                 print(f"  {name:<8} {value if isinstance(value, str) else json.dumps(value)}")
-
-
-def _below(option: Described, key: str) -> bool:
-    """Whether the option stands in the section `key`; a name of the user's, such as a link's, may stand in it."""
-    mine, theirs = option.key.replace("[]", "").split("."), key.split(".")
-    return len(theirs) < len(mine) and all(a in (b, "NAME") for a, b in zip(mine, theirs, strict=False))
 
 
 def _tell(option: Described, key: str, config: Any, layers: Layers) -> dict[str, Any]:

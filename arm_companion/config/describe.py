@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from arm_companion.config.options import Option, describe
 from arm_companion.config.schema import Config
+from arm_companion.config.table import as_table
 
 NAME: Final = "NAME"
 """Stands in a key for a name that the user chooses, as in `links.NAME.url`."""
@@ -52,8 +53,27 @@ class Described:
 
     def fits(self, key: str) -> bool:
         """Whether a dotted key with real names means this option."""
-        mine, theirs = self.key.replace("[]", "").split("."), key.split("[", maxsplit=1)[0].split(".")
-        return len(mine) == len(theirs) and all(a in (b, NAME) for a, b in zip(mine, theirs, strict=True))
+        theirs = key.split("[", maxsplit=1)[0].split(".")
+        return len(self._parts) == len(theirs) and self._begins_with(theirs)
+
+    def is_below(self, section: str) -> bool:
+        """Whether this option stands in a section, which may have real names in it, as `links.ground`."""
+        theirs = section.split(".")
+        return len(self._parts) > len(theirs) and self._begins_with(theirs)
+
+    def within(self, section: str) -> str:
+        """The key, with the real names of a section that it stands in."""
+        theirs = section.split(".")
+        mine = self.key.split(".")
+        named = [real if part == NAME else part for part, real in zip(mine, theirs, strict=False)]
+        return ".".join([*named, *mine[len(named) :]])
+
+    @property
+    def _parts(self) -> list[str]:
+        return self.key.replace("[]", "").split(".")
+
+    def _begins_with(self, parts: list[str]) -> bool:
+        return all(mine in (theirs, NAME) for mine, theirs in zip(self._parts, parts, strict=False))
 
 
 def every(cls: Any = Config, path: str = "") -> Iterator[Described]:
@@ -91,7 +111,7 @@ def _object(cls: Any) -> dict[str, Any]:
         if default is dataclasses.MISSING:
             required.append(f.name)
         elif default is not None:
-            properties[f.name]["default"] = _plain(default)
+            properties[f.name]["default"] = as_table(default)
     body: dict[str, Any] = {"type": "object", "additionalProperties": False, "properties": properties}
     if cls.__doc__:
         body["description"] = cls.__doc__.strip().partition("\n")[0]
@@ -168,9 +188,3 @@ def _default(f: "dataclasses.Field[Any]") -> Any:
     if f.default is not dataclasses.MISSING:
         return f.default
     return f.default_factory() if f.default_factory is not dataclasses.MISSING else dataclasses.MISSING
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, tuple) else value

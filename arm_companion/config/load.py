@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from arm_companion.config.layers import collect
+from arm_companion.config.layers import Layers, collect
 from arm_companion.config.options import read
 from arm_companion.config.schema import Config
 
@@ -19,5 +19,13 @@ def load(file: str | Path, settings: Iterable[str] = (), environment: Mapping[st
     Raises:
         ConfigError: naming file, variable or setting, key, value and allowed range.
     """
-    layers = collect(file, settings, environment)
+    return checked(collect(file, settings, environment))
+
+
+def checked(layers: Layers) -> Config:
+    """The configuration of layers that were collected before.
+
+    Raises:
+        ConfigError: naming file, variable or setting, key, value and allowed range.
+    """
     return read(Config, layers.table, layers.source)

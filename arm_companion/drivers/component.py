@@ -1,6 +1,5 @@
 """Our MAVLink component: its heartbeat and identity, and whatever is addressed to it."""
 
-import enum
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from arm_companion.drivers.parameter_service import ParameterService
 from arm_companion.drivers.settings import Settings
 from arm_companion.drivers.standard_services import Power, StandardServices
 from arm_companion.drivers.status_text import Speaker
+from arm_companion.drivers.system_status import SystemStatus
 from arm_companion.mission.facts import Answer, Bar, Notice, Request
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.ftp import crc32
@@ -38,18 +38,6 @@ CAPABILITIES: Final = (
     | mav.MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_BYTEWISE
     | mav.MAV_PROTOCOL_CAPABILITY_FTP
 )
-
-
-class SystemStatus(enum.IntEnum):
-    """MAV_STATE, as our heartbeat tells it."""
-
-    BOOT = mav.MAV_STATE_BOOT
-    CALIBRATING = mav.MAV_STATE_CALIBRATING
-    STANDBY = mav.MAV_STATE_STANDBY
-    ACTIVE = mav.MAV_STATE_ACTIVE
-    CRITICAL = mav.MAV_STATE_CRITICAL
-    EMERGENCY = mav.MAV_STATE_EMERGENCY
-    POWEROFF = mav.MAV_STATE_POWEROFF
 
 
 @dataclass(slots=True)
@@ -90,6 +78,8 @@ class Component:
         """Who else is told what everybody on MAVLink is told."""
         self.status = SystemStatus.BOOT
         """What the heartbeat says of us."""
+        self.active = False
+        """Whether a behaviour is under way that moves the vehicle."""
         self._links = links
         self._clock = clock
         self._started = clock.now()
@@ -126,15 +116,6 @@ class Component:
             link.subscribe(self._on_timesync, (mav.MAVLINK_MSG_ID_TIMESYNC,))
             link.subscribe(self._on_ping, (mav.MAVLINK_MSG_ID_PING,))
             link.subscribe(self._on_heartbeat, (HEARTBEAT,))
-
-    @property
-    def active(self) -> bool:
-        """Whether a behaviour is under way that moves the vehicle."""
-        return self.status is SystemStatus.ACTIVE
-
-    @active.setter
-    def active(self, value: bool) -> None:
-        self.status = SystemStatus.ACTIVE if value else SystemStatus.STANDBY
 
     def take(self) -> tuple[list[Request], Bar | None]:
         """What has come since the last call: requests in order, and the newest target."""

@@ -1,9 +1,12 @@
-"""The fleet example: what it shows of messages, that its vehicles do not meet, and its screen against mosquitto."""
+"""The fleet example: what it shows of messages, that its vehicles do not meet, its screen, and a flight of two."""
 
 import asyncio
+import contextlib
 import importlib.util
 import json
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -15,6 +18,7 @@ import pytest
 
 from arm_companion.clock import ticks
 from arm_companion.config import load
+from tests.mqtt_broker import Broker, serving
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "fleet" / "fleet.py"
 
@@ -100,6 +104,52 @@ def test_the_screen_follows_a_broker(tmp_path: Path) -> None:
         broker.terminate()
         broker.wait()
     assert {line.split()[0] for line in told.splitlines()} == {"1", "2"}
+
+
+@pytest.mark.realtime
+def test_two_vehicles_that_fly_at_once_are_both_on_the_screen(tmp_path: Path) -> None:
+    wanted = {"online", "STOWED", "READY", "APPROACH"}  # in the air; the perch itself wants a machine for itself
+
+    async def main() -> dict[str, set[str]]:
+        seen: dict[str, set[str]] = {}
+        async with serving(Broker()) as broker:
+            port = ("--port", str(broker.port))
+            words = [sys.executable, str(SCRIPT)]
+            screen = await asyncio.create_subprocess_exec(*words, "watch", *port, stdout=asyncio.subprocess.PIPE)
+            fleet = await asyncio.create_subprocess_exec(
+                *words,
+                "fly",
+                *port,
+                "--output",
+                str(tmp_path),
+                stdout=asyncio.subprocess.DEVNULL,
+                start_new_session=True,
+            )
+            assert screen.stdout is not None
+            try:
+                async with asyncio.timeout(90.0):
+                    while not {name for name, states in seen.items() if states >= wanted} >= {"1", "2"}:
+                        name, availability, state = (await screen.stdout.readline()).decode().split()[:3]
+                        seen.setdefault(name, set()).update((availability, state))
+                    os.killpg(fleet.pid, signal.SIGINT)
+                    while not all("offline" in states for states in seen.values()):
+                        name, availability = (await screen.stdout.readline()).decode().split()[:2]
+                        seen[name].add(availability)
+                    await fleet.wait()
+            except TimeoutError:
+                pytest.fail(f"not on the screen within 90 s: {seen}")
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(fleet.pid, signal.SIGKILL)
+                screen.terminate()
+                await screen.communicate()
+        return seen
+
+    assert set(asyncio.run(main())) == {"1", "2"}
+    for vehicle in ("1", "2"):
+        log = (tmp_path / vehicle / "daemon.log").read_text()
+        assert "READY -> APPROACH" in log
+        assert "Traceback" not in log
 
 
 def test_without_a_broker_it_says_so() -> None:

@@ -5,6 +5,9 @@ import dataclasses
 from collections.abc import Callable, Coroutine
 from typing import Any
 
+import pytest
+
+from arm_companion import app
 from arm_companion.app import Daemon, Openers
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config import load
@@ -53,6 +56,12 @@ class Field:
 
     def status(self) -> Message:
         return self.ground.all("ARM_STATUS")[-1]
+
+    async def heartbeat(self) -> int:
+        """What the next one says of the system."""
+        self.ground.received.clear()
+        await asyncio.sleep(1.1)
+        return int(self.ground.all("HEARTBEAT")[-1].system_status)
 
 
 def play(ground: Any, story: Callable[[Field], Coroutine[Any, Any, None]]) -> None:
@@ -112,13 +121,17 @@ def test_a_loss_of_power_ends_with_clear_errors_and_without_a_restart(ground_pee
 
 def test_a_shut_down_servo_is_rebooted_and_a_dead_one_named(ground_peer: Any) -> None:
     async def story(field: Field) -> None:
+        assert await field.heartbeat() == mav.MAV_STATE_STANDBY
         field.emulator[2].trip(HardwareError.OVERLOAD)
         await asyncio.sleep(0.3)
         assert field.status().errors & mav.ARM_ERROR_OVERLOAD
+        assert await field.heartbeat() == mav.MAV_STATE_CRITICAL
         field.clear_errors()
         await asyncio.sleep(3.0)
         assert field.results() == [mav.MAV_RESULT_IN_PROGRESS, mav.MAV_RESULT_ACCEPTED]
         assert field.emulator[2].peek(ct.HARDWARE_ERROR_STATUS) == 0
+        assert await field.heartbeat() == mav.MAV_STATE_STANDBY
+        assert not field.ground.all("SYS_STATUS"), "the vehicle's battery is taken from it"
         field.emulator[4].silenced = True
         await asyncio.sleep(1.0)
         field.clear_errors()
@@ -147,5 +160,20 @@ def test_a_fault_is_in_the_facts_of_the_very_cycle_in_which_the_bus_tells_it(gro
         after = [record.facts.tendons[2].error_bits for record in field.recorder.records[before:]]
         assert after == [HardwareError.OVERHEATING] * len(after)
         assert len(after) >= 4
+
+    play(ground_peer, story)
+
+
+def test_cycles_that_fail_are_seen_in_the_heartbeat(ground_peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("a bug")
+
+    async def story(field: Field) -> None:
+        with monkeypatch.context() as broken:
+            broken.setattr(app, "step", fail)
+            assert await field.heartbeat() == mav.MAV_STATE_CRITICAL
+        assert await field.heartbeat() == mav.MAV_STATE_STANDBY
+        assert field.daemon.failures > 50
+        field.daemon.failures = 0  # they were meant
 
     play(ground_peer, story)

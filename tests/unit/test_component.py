@@ -15,8 +15,9 @@ import pytest
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config.schema import RatesConfig, VehicleConfig
 from arm_companion.drivers import commands
-from arm_companion.drivers.component import Component, SystemStatus
+from arm_companion.drivers.component import Component
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
+from arm_companion.drivers.system_status import SystemStatus
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.mission.facts import (
     Answer,
@@ -105,14 +106,14 @@ def test_the_first_heartbeat_goes_out_at_once_and_then_one_a_second(fly: Callabl
         assert (first.type, first.autopilot) == (mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID)
         assert first.system_status == SystemStatus.BOOT
         before = len(rig.ground.all("HEARTBEAT"))
-        rig.component.active = True
+        rig.component.status = SystemStatus.ACTIVE
         await asyncio.sleep(10.0)
         beats = rig.ground.all("HEARTBEAT")
         assert len(beats) - before == 10
         assert beats[-1].system_status == mav.MAV_STATE_ACTIVE
-        rig.component.active = False
+        rig.component.status = SystemStatus.CRITICAL
         await asyncio.sleep(1.0)
-        assert rig.ground.all("HEARTBEAT")[-1].system_status == mav.MAV_STATE_STANDBY
+        assert rig.ground.all("HEARTBEAT")[-1].system_status == mav.MAV_STATE_CRITICAL
 
     fly(body)
 

@@ -104,6 +104,14 @@ def test_a_dry_run_does_nothing_and_says_what_it_would(tmp_path: Path, action: s
         assert "pip" in text
 
 
+def test_an_image_of_another_machine_is_filled_from_ready_made_packages_and_only_below_a_root(tmp_path: Path) -> None:
+    text = call("--root", tmp_path, "--dry-run", "--machine", "aarch64")
+    assert "-m venv --without-pip" in text
+    assert "--only-binary=:all: --platform manylinux*_aarch64" in text
+    assert tree(tmp_path) == {}
+    assert "--root" in call("--dry-run", "--machine", "aarch64", code=2, DESTDIR="")
+
+
 def test_uninstalling_leaves_what_is_the_users_and_purging_does_not(tmp_path: Path) -> None:
     install(tmp_path)
     (tmp_path / STATE / "parameters.json").write_text("{}")
@@ -126,7 +134,15 @@ def test_destdir_is_a_root_too(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "words", [("--root",), ("nonsense",), ("--purge", "install"), ("--colour", "red"), ("--extras",)]
+    "words",
+    [
+        ("--root",),
+        ("nonsense",),
+        ("--purge", "install"),
+        ("--colour", "red"),
+        ("--extras",),
+        ("--machine", "sparc"),
+    ],
 )
 def test_wrong_use_is_told_with_the_usage(words: tuple[str, ...], tmp_path: Path) -> None:
     assert "usage:" in call(*words, code=2, DESTDIR=str(tmp_path))

@@ -95,19 +95,21 @@ def settings(number: int, folder: Path, host: str, port: int) -> Iterator[str]:
     yield f"sim.seed={number}"
 
 
-def fly(vehicles: int, host: str, port: int) -> int:
-    """Fly all at once; returns how many failed."""
+def fly(vehicles: int, host: str, port: int, output: Path) -> int:
+    """Fly all at once in real time; returns how many failed."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         flights = []
         for number in range(1, vehicles + 1):
-            words = [sys.executable, "-m", "arm_companion", "sim", "perch", "--output", f"build/fleet/{number}"]
+            words = [sys.executable, "-m", "arm_companion", "sim", "perch", "--output", str(output / str(number))]
             for setting in settings(number, folder, host, port):
                 words += ["--set", setting]
             flights.append(subprocess.Popen(words, stdout=subprocess.DEVNULL))
+        print(f"{vehicles} vehicles fly; their logs and records: {output}", flush=True)
         ends = [flight.wait() for flight in flights]
     for number, end in enumerate(ends, 1):
-        print(f"vehicle {number}: {'perched and landed' if end == 0 else f'failed, exit code {end}'}")
+        where = output / str(number) / "daemon.log"
+        print(f"vehicle {number}: {'perched and landed' if end == 0 else f'exit code {end}, see {where}'}")
     return sum(end != 0 for end in ends)
 
 
@@ -115,16 +117,19 @@ def main() -> int:
     """Fly, or watch."""
     parser = argparse.ArgumentParser(description="Several simulated vehicles on one MQTT broker.")
     parser.add_argument("what", choices=("fly", "watch"))
-    parser.add_argument("--vehicles", type=int, default=2, help="how many fly (default: 2; each wants about a core)")
+    parser.add_argument(
+        "--vehicles", type=int, default=2, help="how many fly (default: 2; each wants half a core to itself)"
+    )
+    parser.add_argument("--output", type=Path, default=Path("build/fleet"), help="folder (default: build/fleet)")
     parser.add_argument("--host", default="127.0.0.1", help="of the broker (default: 127.0.0.1)")
     parser.add_argument("--port", type=int, default=1883, help="of the broker (default: 1883)")
     arguments = parser.parse_args()
-    if arguments.what == "fly":
-        return 1 if fly(arguments.vehicles, arguments.host, arguments.port) else 0
     try:
+        if arguments.what == "fly":
+            return 1 if fly(arguments.vehicles, arguments.host, arguments.port, arguments.output) else 0
         asyncio.run(watch(arguments.host, arguments.port))
-    except KeyboardInterrupt:
-        pass
+    except KeyboardInterrupt:  # the flights have had it too, and end by themselves
+        return 130
     except aiomqtt.MqttError as error:
         print(f"broker at {arguments.host}:{arguments.port}: {error}", file=sys.stderr)
         return 1
