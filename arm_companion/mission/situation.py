@@ -1,6 +1,5 @@
 """One cycle as the guards and actions see it: facts, memory, parameters and what follows from them."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,10 +14,10 @@ from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Order, Vec3
 from arm_companion.mission.motion import ZERO, add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
+from arm_companion.values import replace
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
-_FROM_FACTS = frozenset({"gravity_a", "mount", "bend"})
 
 
 @dataclass(frozen=True)
@@ -31,7 +30,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Situation:
-    """Facts, memory and parameters of one cycle."""
+    """Facts, memory and parameters of one cycle; only what does not depend on memory is cached."""
 
     state: State
     facts: Facts
@@ -39,11 +38,8 @@ class Situation:
     parameters: Parameters
 
     def remembering(self, state: State) -> "Situation":
-        """The same cycle with other memory; what follows from the facts alone is not computed again."""
-        other = dataclasses.replace(self, state=state)
-        for name in _FROM_FACTS & self.__dict__.keys():
-            other.__dict__[name] = self.__dict__[name]
-        return other
+        """The same cycle with other memory; the cached properties, which follow from the facts alone, go along."""
+        return replace(self, state=state)
 
     @property
     def config(self) -> Config:
@@ -190,7 +186,7 @@ class Situation:
         vigil = self.state.vigil
         if vigil.shift == ZERO or self.t - age > vigil.jumped_at:  # nothing jumped since it was told
             return bar
-        return dataclasses.replace(bar, point_w=add(bar.point_w, vigil.shift))
+        return replace(bar, point_w=add(bar.point_w, vigil.shift))
 
     def base_offset_w(self, yaw: float) -> Vec3:
         """From the vehicle's centre of mass to the arm's base while it hovers at `yaw`, world axes."""
