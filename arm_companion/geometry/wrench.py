@@ -46,4 +46,4 @@ def transform_matrix(T_ab: Pose) -> Array:
 @functools.lru_cache(maxsize=4)
 def rotation_matrix(T_ab: Pose) -> Array:
     """X (6, 6) with X @ w_b = rotated(w_b, R_ab), of wrenches and of twists."""
-    return sealed(np.kron(np.eye(2), T_ab.rotation))
+    return sealed(np.asarray(np.kron(np.eye(2), T_ab.rotation), dtype=np.float64))

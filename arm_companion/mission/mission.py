@@ -18,7 +18,7 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
-from arm_companion.mission.notices import WARNINGS
+from arm_companion.mission.notices import TOLD_IN
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
@@ -230,9 +230,9 @@ def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error
 def _warn(s: Situation, notices: list[Notice]) -> State:
     """Say once per phase what a person must know and no transition tells; what the reason counts may go on changing."""
     state = s.state
-    for told in WARNINGS:
+    for told in TOLD_IN[state.phase]:
         name = told.guard.__name__
-        if state.phase not in told.phases or name in state.warned or (reason := told.guard(s)) is None:
+        if name in state.warned or (reason := told.guard(s)) is None:
             continue
         notices.append(Notice(told.severity, f"{reason}; {told.consequence}" if told.consequence else reason))
         state = replace(state, warned=state.warned | {name}, errors=state.errors | told.error)

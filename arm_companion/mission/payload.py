@@ -110,13 +110,12 @@ class ThrustCurve:
 
     def learn(self, flow: Flow, felt: float, dt: float) -> "ThrustCurve":
         """The curve after `dt` seconds in which the rotors lifted the vehicle's mass by `felt` = g - dv/dt, m/s^2."""
-        h = self._regressor(flow)
-        P = np.array(self.covariance)
+        h, before, P = self._regressor(flow), np.array(self.theta), np.array(self.covariance)
         P[0, 0] += _DRIFT**2 * dt
         Ph = P @ h
         gain = Ph / (h @ Ph + _SPECTRUM / dt)
-        theta = np.array(self.theta) + gain * (felt - self.lift(flow))
-        P -= np.outer(gain, Ph)
+        theta = before + gain * (felt - float(h @ before))
+        P -= gain[:, None] * Ph
         return replace(self, theta=_three(theta), covariance=_rows(0.5 * (P + P.T)))
 
     def _regressor(self, flow: Flow) -> Array:
@@ -239,7 +238,8 @@ def _filtered(old: Flow, new: Flow, dt: float) -> Flow:
 
 
 def _three(v: Array) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
+    x, y, z = v.tolist()
+    return x, y, z
 
 
 def _rows(P: Array) -> Covariance:

@@ -41,7 +41,7 @@ class Situation:
         """The same cycle with other memory; the cached properties, which follow from the facts alone, go along."""
         return replace(self, state=state)
 
-    @property
+    @cached_property
     def config(self) -> Config:
         """The whole configuration."""
         return self.parameters.config
@@ -58,7 +58,7 @@ class Situation:
 
     # --- the vehicle ---
 
-    @property
+    @cached_property
     def vehicle_fresh(self) -> bool:
         """Whether position and attitude are new enough to act on."""
         v = self.facts.vehicle

@@ -39,6 +39,8 @@ class Phase(enum.Enum):
     TAKE_BACK = 23
     HANG_HOLD = 24
 
+    __hash__ = object.__hash__  # an enumeration's own takes longer than the look-up, dozens of times in a cycle
+
 
 CARRYING = frozenset({Phase.LIFT, Phase.CARRY, Phase.PLACE})
 """Phases in which the vehicle alone holds up what the arm holds."""
