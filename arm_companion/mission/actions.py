@@ -151,7 +151,7 @@ def _tight_enough(s: Situation) -> bool:
 
     A bar thicker, or a backbone stiffer, than believed: the pull test says whether this grip holds.
     """
-    if s.state.phase not in _CURLS or s.state.bend == s.state.bend_goal:
+    if s.state.phase not in _CURLS or s.at_bend_goal:
         return False
     return max(s.state.tension, default=0.0) >= _TIGHT_SHARE * s.config.limits.tension_max_n
 
@@ -160,7 +160,7 @@ def _loose(s: Situation) -> bool:
     """Whether a wrap has come to its full bend, or beyond, without the tension of a grip."""
     return (
         s.state.phase is Phase.WRAP
-        and s.state.bend == s.state.bend_goal
+        and s.at_bend_goal
         and math.hypot(*s.state.bend) >= s.config.perch.wrap_bend_rad - _AT_BEND_RAD
         and max(s.state.tension, default=0.0) < s.grip_needed
     )
@@ -191,9 +191,7 @@ def _ahead_of_the_others(s: Situation) -> bool:
 
 def _pretension(s: Situation, theta: float) -> float:
     """Co-contraction, N: enough that the outer tendon of a bend `theta` keeps the least tension."""
-    arm = s.parameters.model.parameters
-    swing = theta * arm.EI / (2.0 * arm.r * arm.L)  # tau_i = T0 + swing cos(phi_i - delta), model.md
-    return max(s.config.arm.tendons.pretension_n, swing + s.config.limits.tension_min_n)
+    return max(s.config.arm.tendons.pretension_n, s.tension_swing(theta) + s.config.limits.tension_min_n)
 
 
 def setpoint(s: Situation) -> Setpoint | None:
@@ -222,7 +220,7 @@ def progress(s: Situation) -> int:
 
 
 def _at_rest(s: Situation) -> bool:
-    return s.state.bend == s.state.bend_goal or not all(tendon.torque for tendon in s.facts.tendons)
+    return s.at_bend_goal or not all(tendon.torque for tendon in s.facts.tendons)
 
 
 def _here(s: Situation) -> Reference:

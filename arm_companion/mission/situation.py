@@ -143,6 +143,11 @@ class Situation:
         return float(u[0]), float(u[1])
 
     @property
+    def at_bend_goal(self) -> bool:
+        """Whether the commanded bend has come to its goal: in a wrap the full one, in a release the straight arm."""
+        return self.state.bend == self.state.bend_goal
+
+    @property
     def bend_error(self) -> float:
         """Distance between commanded and measured bend, rad."""
         return math.hypot(self.bend[0] - self.state.bend[0], self.bend[1] - self.state.bend[1])
@@ -245,9 +250,17 @@ class Situation:
 
         The outer tendon keeps the least tension, the inner has twice the bend's moment on top (model.md).
         """
-        arm, perch = self.parameters.model.parameters, self.config.perch
+        perch = self.config.perch
         beyond = max(math.hypot(*self.state.bend) - perch.wrap_bend_rad, 0.0)
-        return perch.grip_tension_n + beyond * arm.EI / (arm.r * arm.L)
+        return perch.grip_tension_n + 2.0 * self.tension_swing(beyond)
+
+    def tension_swing(self, theta: float) -> float:
+        """By how much a free bend `theta`, rad, tightens its inner tendon and slackens its outer one, N (model.md).
+
+        tau_i = T0 + swing cos(phi_i - delta).
+        """
+        arm = self.parameters.model.parameters
+        return theta * arm.EI / (2.0 * arm.r * arm.L)
 
     @property
     def probe(self) -> Vec3:
