@@ -1,5 +1,7 @@
 """Dataclasses <-> JSON text, exactly: floats keep every bit, and types come from annotations.
 
+They are plain ones, as `values` has them: no slots, no `__post_init__`.
+
 JSON has no numbers for what is not finite; these are the strings "nan", "inf" and "-inf", so that every reader of
 JSON takes the text.
 """
@@ -13,6 +15,8 @@ import types
 import typing
 from collections.abc import Callable
 from typing import Any, TypeVar
+
+from arm_companion.values import of
 
 T = TypeVar("T")
 UNRECORDED = {"unrecorded": True}
@@ -162,10 +166,19 @@ def _builder(hint: Any) -> Callable[[Any], Any]:
     return _same
 
 
+def _floats(count: int, value: list[Any]) -> tuple[float, ...]:
+    numbers = tuple(map(float, value))
+    if len(numbers) != count:
+        raise ValueError(f"{count} numbers are expected, not {len(numbers)}")
+    return numbers
+
+
 def _tuple_builder(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
     if len(inner) == 2 and inner[1] is Ellipsis:  # tuple[x, ...]
         each = _builder(inner[0])
-        return lambda value: tuple([each(item) for item in value])
+        return lambda value: tuple(map(each, value))
+    if set(inner) == {float}:
+        return functools.partial(_floats, len(inner))
     builders = [_builder(hint) for hint in inner]
     return lambda value: tuple([make(item) for make, item in zip(builders, value, strict=True)])
 
@@ -175,17 +188,21 @@ def _record_builder(cls: Any) -> Callable[[Any], Any]:
     names = kinds.keys()
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _builder(hint)) != _same]
+    every = dataclasses.fields(cls)
+    defaults = {f.name: f.default for f in every if f.default is not dataclasses.MISSING}
 
     def make(table: dict[str, Any]) -> Any:
         if not table.keys() <= names:
             raise KeyError(*(table.keys() - names))
-        table = dict(table)
+        value = defaults | table
+        if len(value) != len(every):
+            raise KeyError(*(f.name for f in every if f.name not in value))
         for name in numbers:
-            if type(table.get(name, 0.0)) is not float:
-                table[name] = float(table[name])
+            if type(value[name]) is not float:
+                value[name] = float(value[name])
         for name, each in others:
             if name in table:
-                table[name] = each(table[name])
-        return cls(**table)
+                value[name] = each(table[name])
+        return of(cls, value)
 
     return make

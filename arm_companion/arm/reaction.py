@@ -218,7 +218,8 @@ def inertial(solution: ArmSolution, T_ba: Pose, gravity: Array, motion: BodyMoti
     """What the arm's mass adds (6,), base point and axes, since the field is not the one it was solved in."""
     R, r = T_ba.rotation, T_ba.position
     omega, alpha = motion.rate, motion.angular_acceleration
-    spin = so3.hat(alpha) + so3.hat(omega) @ so3.hat(omega)
+    turning = so3.hat(omega)
+    spin = so3.hat(alpha) + turning @ turning
     b = gravity - R.T @ (motion.acceleration + spin @ r) - solution.gravity
     A = -R.T @ spin @ R
     m = solution.moments
@@ -236,22 +237,22 @@ def _sigma(solution: ArmSolution, T_ba: Pose, at_base: Array, spread: Spread) ->
     X = wrench.transform_matrix(T_ba)
     g = solution.gravity
     weight = np.concatenate((solution.moments.mass * g, so3.cross(solution.moments.first, g)))
-    columns = [
-        spread.EI * d.parameters["EI"],
-        spread.GJ * d.parameters["GJ"],
-        spread.k_T * d.parameters["k_T"],
-        spread.T0 * d.parameters["T0"],
-        spread.mass * weight,
-        *(spread.pull * d.pull).T,
-        *(spread.hold_position * d.hold[:, :3]).T,
-        *(spread.hold_rotation * d.hold[:, 3:]).T,
-        *(spread.gravity_direction * (d.gravity @ so3.hat(g))).T,
-        *(spread.tip_force * d.tip_wrench[:, :3]).T,
-    ]
-    variance = ((X @ np.column_stack(columns)) ** 2).sum(axis=1)
+    columns = (
+        (spread.EI * d.parameters["EI"])[:, None],
+        (spread.GJ * d.parameters["GJ"])[:, None],
+        (spread.k_T * d.parameters["k_T"])[:, None],
+        (spread.T0 * d.parameters["T0"])[:, None],
+        (spread.mass * weight)[:, None],
+        spread.pull * d.pull,
+        spread.hold_position * d.hold[:, :3],
+        spread.hold_rotation * d.hold[:, 3:],
+        spread.gravity_direction * (d.gravity @ so3.hat(g)),
+        spread.tip_force * d.tip_wrench[:, :3],
+    )
+    variance = ((X @ np.concatenate(columns, axis=1)) ** 2).sum(axis=1)
     F, M = T_ba.rotation @ at_base[:3], T_ba.rotation @ at_base[3:]
-    turned = np.vstack((so3.hat(F), so3.hat(M) + so3.hat(T_ba.position) @ so3.hat(F)))
     shifted = so3.hat(F)
+    turned = np.vstack((shifted, so3.hat(M) + so3.hat(T_ba.position) @ shifted))
     variance += spread.mount_rotation**2 * (turned**2).sum(axis=1)
     variance[3:] += spread.mount_position**2 * (shifted**2).sum(axis=1)
     return np.asarray(np.sqrt(variance))

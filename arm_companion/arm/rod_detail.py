@@ -111,27 +111,26 @@ class RodDetail:
         by_gravity, first = self._by_gravity(state)
         T0 = rod.parameters.T0
         stretch = (cables.tension - T0) * taut
-        load = np.column_stack(  # dr / d parameter
-            (
-                (cables.path * (problem.stiffness * taut)[:, None]).T,
-                -by_gravity,
-                rod.bend_diagonal * solved.c,
-                rod.twist_diagonal * solved.c,
-                stretch @ cables.path,
-                (T0 * taut) @ cables.path,
-            )
-        )
+        held_by = problem.stiffness * taut
+        right = np.empty((solved.c.size, n + 13))  # what the unknowns answer to: minus dr / d parameter, then end loads
+        right[:, :n] = -(cables.path * held_by[:, None]).T
+        right[:, n : n + 3] = by_gravity
+        right[:, n + 3] = -(rod.bend_diagonal * solved.c)
+        right[:, n + 4] = -(rod.twist_diagonal * solved.c)
+        right[:, n + 5] = -(stretch @ cables.path)
+        right[:, n + 6] = -((T0 * taut) @ cables.path)
+        right[:, n + 7 :] = J
         by_c = self._base_by_unknowns(state)
         position = state.tip if support is None else state.tip + state.R_tip @ support.pivot
         direct_tip = _wrench_at(position)
         try:
             if support is None:
-                answer = np.linalg.solve(K, np.hstack((-load, J)))
+                answer = np.linalg.solve(K, right)
                 compliance, moved = J.T @ answer[:, -6:], answer[:, -6:]
                 D = by_c @ answer
                 hold, tip = np.zeros((6, 6)), D[:, -6:] + direct_tip
             else:
-                D, hold, compliance, moved = self._held(K, load, by_c, J, support, direct_tip)
+                D, hold, compliance, moved = self._held(K, right[:, : n + 7], by_c, J, support, direct_tip)
                 tip = np.zeros((6, 6))
         except np.linalg.LinAlgError:
             raise NoSolution(float("inf"), "the equilibrium is singular") from None
@@ -144,12 +143,12 @@ class RodDetail:
             hold=sealed(hold),
             tip_wrench=sealed(tip),
             parameters=MappingProxyType({name: sealed(D[:, n + 3 + k].copy()) for k, name in enumerate(names)}),
-            tension=sealed((problem.stiffness * taut)[:, None] * (cables.path @ moved)),
+            tension=sealed(held_by[:, None] * (cables.path @ moved)),
             compliance=sealed(compliance),
         )
 
     def _held(
-        self, K: Array, load: Array, by_c: Array, J: Array, support: rod_solver.Support, direct: Array
+        self, K: Array, by_parameters: Array, by_c: Array, J: Array, support: rod_solver.Support, direct: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Base wrench by parameters (6, p) and by hold (6, 6), compliance (6, 6), unknowns by hold (size, 6)."""
         state, size = self.solved.state, K.shape[0]
@@ -168,21 +167,22 @@ class RodDetail:
             hold[size + 3 :, 3:] = -support.moments if support.axis is not None else -np.eye(3)
         if support.axis is not None:
             hold[:size, 3:] = state.J_phi @ so3.hat(moment)
-        right = np.zeros((size + k, load.shape[1] + 6))
-        right[:size, : load.shape[1]] = -load
-        right[:, load.shape[1] :] = -hold
+        count = by_parameters.shape[1]
+        right = np.zeros((size + k, count + 6))
+        right[:size, :count] = by_parameters
+        right[:, count:] = -hold
         answer = np.linalg.solve(A, right)
         out = np.zeros((6, size + k))
         out[:, :size] = by_c
         out[:, size : size + 3] = direct[:, :3]
         out[3:, size + 3 :] = support.moments.T
         D = out @ answer
-        by_hold = D[:, load.shape[1] :]
+        by_hold = D[:, count:]
         if support.axis is not None:
             by_hold = by_hold.copy()
             by_hold[3:, 3:] -= so3.hat(moment)
         compliance = J.T @ np.linalg.solve(K, J)
-        return D[:, : load.shape[1]], by_hold, compliance, answer[:size, load.shape[1] :]
+        return D[:, :count], by_hold, compliance, answer[:size, count:]
 
     def _by_gravity(self, state: State) -> tuple[Array, Array]:
         """Work of a unit field on every unknown (size, 3), and the first moment of mass (3,), kg m."""
@@ -192,10 +192,9 @@ class RodDetail:
         t = state.t
         rest = (t * beyond) @ mesh.outer + o[:, None]  # its moment per unit field is rest x g
         work = np.empty((3, 3 * mesh.modes))
-        for a in range(3):
-            m = np.zeros_like(rest)
-            m[(a + 1) % 3], m[(a + 2) % 3] = rest[(a + 2) % 3], -rest[(a + 1) % 3]
-            work[a] = ((state.D[:, :3] * m).sum(axis=1) @ mesh.weighted.T).reshape(-1)
+        for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+            turning = state.D[:, b] * rest[c] - state.D[:, c] * rest[b]
+            work[a] = (turning @ mesh.weighted.T).reshape(-1)
         return work.T[: mesh.size], t @ (mesh.weights * beyond) + o
 
     def _base_by_unknowns(self, state: State) -> Array:

@@ -80,15 +80,13 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
     H, c, k = parameters.H, parameters.chord_loss, parameters.k_T
     scale = float(parameters.bending.max())
     u = np.linalg.lstsq(H, q - q.mean(), rcond=None)[0]
-    residual = np.inf
+    tau, residual = stretch_tension(parameters, u, q), np.inf
     for _ in range(_ITERATIONS):
-        tau = stretch_tension(parameters, u, q)
         g = bending_moment(parameters, u, tau)
         residual = float(np.abs(g).max()) / scale
         if residual < _tolerance(parameters, tau):
             break
-        u = u - _descent(parameters, u, tau, H + 2 * c * u, k * (tau > 0), g, q)
-    tau = stretch_tension(parameters, u, q)
+        u, tau = _descent(parameters, u, tau, H + 2 * c * u, k * (tau > 0), g, q)
     if (parameters.bending - 2 * tau @ c).min() <= 0:
         raise LimitViolated("sum of tensions", float(tau.sum()), 0.0, buckling_tension(parameters))
     if residual >= _tolerance(parameters, tau):
@@ -106,19 +104,25 @@ def _tolerance(parameters: ArmParameters, tau: Array) -> float:
     return _TOLERANCE * (1 + float(tau.max(initial=0.0)) * parameters.r / float(parameters.bending.max()))
 
 
-def _descent(parameters: ArmParameters, u: Array, tau: Array, path: Array, k: Array, g: Array, q: Array) -> Array:
-    """The Newton step, halved until the energy falls (a kink where a tendon goes slack can overshoot)."""
+def _descent(
+    parameters: ArmParameters, u: Array, tau: Array, path: Array, k: Array, g: Array, q: Array
+) -> tuple[Array, Array]:
+    """Bend and tensions after a Newton step, halved until the energy falls.
+
+    A kink where a tendon goes slack can overshoot.
+    """
     K = path.T @ (k[:, None] * path) + np.diag(parameters.bending - 2 * tau @ parameters.chord_loss)
     step = np.linalg.solve(K, g)
-    start = _energy(parameters, u, q)
+    start = _energy(parameters, u, tau)
     rounding = 1e-12 * abs(start)  # below it the energy cannot tell better from worse
     for _ in range(30):
-        if _energy(parameters, u - step, q) <= start - 1e-4 * float(step @ g) + rounding:
-            break
+        there = u - step
+        tension = stretch_tension(parameters, there, q)
+        if _energy(parameters, there, tension) <= start - 1e-4 * float(step @ g) + rounding:
+            return there, tension
         step = 0.5 * step
-    return np.asarray(step)
+    return u - step, stretch_tension(parameters, u - step, q)
 
 
-def _energy(parameters: ArmParameters, u: Array, q: Array) -> float:
-    tau = stretch_tension(parameters, u, q)
+def _energy(parameters: ArmParameters, u: Array, tau: Array) -> float:
     return float(0.5 * parameters.bending @ (u * u) + 0.5 * (tau * tau / parameters.k_T).sum())

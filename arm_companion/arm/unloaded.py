@@ -1,9 +1,11 @@
 """The arm without load and gravity, where every segment is an exact arc: what all models of it share."""
 
+import numpy as np
+
 from arm_companion.arm import arc, statics
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.errors import ConfigError
-from arm_companion.geometry.arrays import Array, ArrayLike
+from arm_companion.geometry.arrays import Array, ArrayLike, sealed
 
 
 class UnloadedArm:
@@ -11,6 +13,7 @@ class UnloadedArm:
 
     def __init__(self, parameters: ArmParameters) -> None:
         self._parameters = parameters
+        self._bends: dict[bytes, Array] = {}
 
     @property
     def parameters(self) -> ArmParameters:
@@ -26,8 +29,12 @@ class UnloadedArm:
         return statics.pull_for_tension(self._parameters, bend, tension)
 
     def bend_for_pull(self, pull: ArrayLike) -> Array:
-        """See `ArmModel.bend_for_pull`."""
-        return statics.bend_for_pull(self._parameters, pull)
+        """See `ArmModel.bend_for_pull`; the last answer is kept, for servos at rest tell the same again and again."""
+        q = np.asarray(pull, dtype=np.float64)
+        asked = q.tobytes()
+        if asked not in self._bends:
+            self._bends = {asked: sealed(statics.bend_for_pull(self._parameters, q))}
+        return self._bends[asked]
 
     def bend_for_tip(self, p_tip_base: ArrayLike, tolerance: float | None = None) -> Array:
         """See `ArmModel.bend_for_tip`.

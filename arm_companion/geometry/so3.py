@@ -14,7 +14,7 @@ _NEAR_PI = 1e-3  # distance from pi inside which the logarithm is taken from the
 
 
 def _components(v: ArrayLike) -> tuple[float, float, float]:
-    x, y, z = v
+    x, y, z = v.tolist() if isinstance(v, np.ndarray) else v  # plain numbers: NumPy's own are slow one by one
     return x, y, z  # type: ignore[return-value]
 
 
@@ -28,7 +28,7 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
 def hat(v: ArrayLike) -> Array:
     """Skew matrix K (3, 3) of v (3,): K @ w is v x w."""
     x, y, z = _components(v)
-    return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
+    return np.array((0.0, -z, y, z, 0.0, -x, -y, x, 0.0)).reshape(3, 3)
 
 
 def vee(K: Array) -> Array:

@@ -1,9 +1,11 @@
 """Wrenches [force; torque] and twists [linear; angular], (6,) each, and how they change point and frame."""
 
+import functools
+
 import numpy as np
 
 from arm_companion.geometry import so3
-from arm_companion.geometry.arrays import Array, ArrayLike
+from arm_companion.geometry.arrays import Array, ArrayLike, sealed
 from arm_companion.geometry.se3 import Pose
 
 
@@ -30,6 +32,7 @@ def transformed(wrench: ArrayLike, T_ab: Pose) -> Array:
     return at_point(rotated(wrench, T_ab.rotation), T_ab.position)
 
 
+@functools.lru_cache(maxsize=4)  # a mount never moves
 def transform_matrix(T_ab: Pose) -> Array:
     """X (6, 6) with X @ w_b = transformed(w_b, T_ab); its transpose maps twists of a to twists of b."""
     X = np.zeros((6, 6))
@@ -37,4 +40,10 @@ def transform_matrix(T_ab: Pose) -> Array:
     X[:3, :3] = R
     X[3:, 3:] = R
     X[3:, :3] = so3.hat(T_ab.position) @ R
-    return X
+    return sealed(X)
+
+
+@functools.lru_cache(maxsize=4)
+def rotation_matrix(T_ab: Pose) -> Array:
+    """X (6, 6) with X @ w_b = rotated(w_b, R_ab), of wrenches and of twists."""
+    return sealed(np.asarray(np.kron(np.eye(2), T_ab.rotation), dtype=np.float64))

@@ -1,6 +1,5 @@
 """What each phase does while it lasts: arm bend, vehicle reference and set-point."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -26,6 +25,7 @@ from arm_companion.mission.sharing import SHARING, SUSPENDED, begin, hung_refere
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
+from arm_companion.values import replace
 
 _PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | SUSPENDED
 _REFERENCE_RESTS = frozenset(
@@ -87,11 +87,11 @@ def _prepare(s: Situation) -> State:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
             # from where the arm really is, so that torque coming on never jerks it
             bend = s.bend if _at_rest(s) else state.bend
-            return dataclasses.replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
+            return replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
-            return dataclasses.replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
+            return replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
         case Phase.APPROACH:
-            return dataclasses.replace(
+            return replace(
                 state,
                 heading=s.heading_to_bar(),
                 anchor=None,
@@ -100,15 +100,15 @@ def _prepare(s: Situation) -> State:
                 reference=state.reference or _here(s),
             )
         case Phase.REACH:
-            return dataclasses.replace(state, force=dataclasses.replace(state.force, tared_s=0.0, above_s=0.0))
+            return replace(state, force=replace(state.force, tared_s=0.0, above_s=0.0))
         case Phase.CONTACT:
-            return dataclasses.replace(state, contact_w=_touching(s))
+            return replace(state, contact_w=_touching(s))
         case Phase.WRAP | Phase.CLOSE:
             x, y = s.towards_bar_a
             theta = s.config.perch.wrap_bend_rad
-            return dataclasses.replace(state, bend_goal=(theta * x, theta * y))
+            return replace(state, bend_goal=(theta * x, theta * y))
         case Phase.VERIFY:
-            return dataclasses.replace(
+            return replace(
                 state,
                 anchor=grip(s),
                 offset=ZERO,
@@ -116,9 +116,9 @@ def _prepare(s: Situation) -> State:
             )
         case Phase.PERCHED if state.anchor is not None:
             place = state.anchor.position_w
-            return dataclasses.replace(state, rest=place, reference=Reference(place, ZERO, state.heading))
+            return replace(state, rest=place, reference=Reference(place, ZERO, state.heading))
         case Phase.UNLOAD:
-            return dataclasses.replace(state, offset=ZERO, bend_goal=state.bend)
+            return replace(state, offset=ZERO, bend_goal=state.bend)
     return state
 
 
@@ -128,15 +128,15 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     Returns:
         Memory, what the servos do, and their goals (m of tendon taken in) when they are driven.
     """
-    settled = carry.settle(s) if s.grasping else dataclasses.replace(s.state, rest=_rest(s), sharing=share_on(s))
+    settled = carry.settle(s) if s.grasping else replace(s.state, rest=_rest(s), sharing=share_on(s))
     s = s.remembering(settled)
-    state = dataclasses.replace(s.state, reference=_reference(s), lean=_lean(s))
+    state = replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
     if _tight_enough(s):
-        state = dataclasses.replace(state, bend_goal=state.bend)
+        state = replace(state, bend_goal=state.bend)
     elif _loose(s):
-        state = dataclasses.replace(state, bend_goal=_tighter(s))
+        state = replace(state, bend_goal=_tighter(s))
     speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
     if not s.parameters.admits(state.bend, bend):
@@ -145,7 +145,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     if bend != state.bend or not pulls:
         goal = s.parameters.model.pull_for_bend(np.asarray(bend), _pretension(s, math.hypot(*bend)))
         pulls = tuple(float(pull) for pull in goal)
-    return dataclasses.replace(state, bend=bend, pulls=pulls), ArmAction.DRIVE, pulls
+    return replace(state, bend=bend, pulls=pulls), ArmAction.DRIVE, pulls
 
 
 def _tight_enough(s: Situation) -> bool:
@@ -153,7 +153,7 @@ def _tight_enough(s: Situation) -> bool:
 
     A bar thicker, or a backbone stiffer, than believed: the pull test says whether this grip holds.
     """
-    if s.state.phase not in _CURLS or s.state.bend == s.state.bend_goal:
+    if s.state.phase not in _CURLS or s.at_bend_goal:
         return False
     return max(s.state.tension, default=0.0) >= _TIGHT_SHARE * s.config.limits.tension_max_n
 
@@ -162,7 +162,7 @@ def _loose(s: Situation) -> bool:
     """Whether a wrap has come to its full bend, or beyond, without the tension of a grip."""
     return (
         s.state.phase is Phase.WRAP
-        and s.state.bend == s.state.bend_goal
+        and s.at_bend_goal
         and math.hypot(*s.state.bend) >= s.config.perch.wrap_bend_rad - _AT_BEND_RAD
         and max(s.state.tension, default=0.0) < s.grip_needed
     )
@@ -193,9 +193,7 @@ def _ahead_of_the_others(s: Situation) -> bool:
 
 def _pretension(s: Situation, theta: float) -> float:
     """Co-contraction, N: enough that the outer tendon of a bend `theta` keeps the least tension."""
-    arm = s.parameters.model.parameters
-    swing = theta * arm.EI / (2.0 * arm.r * arm.L)  # tau_i = T0 + swing cos(phi_i - delta), model.md
-    return max(s.config.arm.tendons.pretension_n, swing + s.config.limits.tension_min_n)
+    return max(s.config.arm.tendons.pretension_n, s.tension_swing(theta) + s.config.limits.tension_min_n)
 
 
 def setpoint(s: Situation) -> Setpoint | None:
@@ -224,7 +222,7 @@ def progress(s: Situation) -> int:
 
 
 def _at_rest(s: Situation) -> bool:
-    return s.state.bend == s.state.bend_goal or not all(tendon.torque for tendon in s.facts.tendons)
+    return s.at_bend_goal or not all(tendon.torque for tendon in s.facts.tendons)
 
 
 def _here(s: Situation) -> Reference:
@@ -238,18 +236,18 @@ def _reference(s: Situation) -> Reference | None:
     if not state.streaming:
         return state.reference
     if not s.vehicle_fresh:  # frozen, and at rest: acting on old state is worse than waiting
-        return None if state.reference is None else dataclasses.replace(state.reference, velocity=ZERO)
+        return None if state.reference is None else replace(state.reference, velocity=ZERO)
     if not (s.external and s.wants_stream):
         return _here(s)
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:
         if astray(s) is not None:
             return _here(s)  # a vehicle that follows again stays where it is
-        return dataclasses.replace(reference, velocity=ZERO)
+        return replace(reference, velocity=ZERO)
     if state.phase in SHARING:
         return hung_reference(s, reference)
     if state.phase is Phase.RELEASE and state.contact_w == ZERO:  # after a restart nobody knows where the bar was met
-        return dataclasses.replace(reference, velocity=ZERO)
+        return replace(reference, velocity=ZERO)
     if state.phase in (*_CURLS, Phase.RELEASE):
         return Reference(_beside_bar(s), ZERO, state.heading)
     goal, speed = _goal(s)

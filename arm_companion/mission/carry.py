@@ -1,6 +1,5 @@
 """What carrying does in each cycle: the load is weighed, lifted with a push of its own, and set down again."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -13,6 +12,7 @@ from arm_companion.mission.motion import ZERO, add, norm, scale, sub
 from arm_companion.mission.payload import Load, interrupted, watch_load, weigh
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Anchor, Phase, State
+from arm_companion.values import replace
 
 _UNTOUCHED = frozenset(
     {
@@ -60,7 +60,7 @@ def track_load(s: Situation) -> Load:
     little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
     light = state.phase in CARRYING and load.now < little
     grip = load.grip + s.dt / (_GRIP_S + s.dt) * (tightest - load.grip) if state.phase in CARRYING else 0.0
-    load = dataclasses.replace(load, grip=grip, light_s=load.light_s + s.dt if light else 0.0)
+    load = replace(load, grip=grip, light_s=load.light_s + s.dt if light else 0.0)
     return weigh(load, s.dt) if state.phase in (Phase.LIFT, Phase.CARRY) and not light else load
 
 
@@ -69,22 +69,20 @@ def prepare(s: Situation) -> State:
     state = s.state
     match state.phase:
         case Phase.APPROACH:  # from here on the way back is known, whatever comes
-            return dataclasses.replace(state, contact_w=s.place(0.0))
+            return replace(state, contact_w=s.place(0.0))
         case Phase.VERIFY:  # from here the object is lifted, and here it is set down again
             place = state.position
             anchor = Anchor(place, s.facts.vehicle.attitude_wb, state.tension)
             test = (0.0, 0.0, -s.config.grasp.verify_lift_m)
-            reference = None if state.reference is None else dataclasses.replace(state.reference, position=place)
-            return dataclasses.replace(
-                state, anchor=anchor, rest=place, offset=test, bend_goal=state.bend, reference=reference
-            )
+            reference = None if state.reference is None else replace(state.reference, position=place)
+            return replace(state, anchor=anchor, rest=place, offset=test, bend_goal=state.bend, reference=reference)
         case Phase.LIFT:  # what the object weighs is found anew
-            load = dataclasses.replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0)
-            return dataclasses.replace(state, offset=ZERO, load=load)
+            load = replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0)
+            return replace(state, offset=ZERO, load=load)
         case Phase.RELEASE if state.anchor is not None:  # of a closed arm, wherever that is: out as it came in
             closed = state.position  # where it rests on the object, and not where it was asked to sink to
             contact = sub(closed, scale(s.straight_w, s.config.perch.contact_arc_m))
-            return dataclasses.replace(state, contact_w=contact, anchor=None)
+            return replace(state, contact_w=contact, anchor=None)
     return state
 
 
@@ -94,7 +92,7 @@ def settle(s: Situation) -> State:
     if state.phase is not Phase.VERIFY or s.elapsed >= _STEADY_S or state.anchor is None or not s.vehicle_fresh:
         return state
     rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
-    return dataclasses.replace(state, rest=rest, anchor=dataclasses.replace(state.anchor, position_w=rest))
+    return replace(state, rest=rest, anchor=replace(state.anchor, position_w=rest))
 
 
 def goal(s: Situation) -> tuple[Vec3, float]:

@@ -7,11 +7,12 @@ what is left over is a force from outside.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import TendonState, Vec3, VehicleState
 from arm_companion.mission.motion import add, norm, rotate, scale, sub
+from arm_companion.values import replace
 
 _POLE = 9.0  # rad/s, both poles of the observer
 OBSERVER_LAG_S = 2.0 / _POLE
@@ -24,7 +25,7 @@ _JUMP_M = 0.2
 Vec2 = tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ForceObserver:
     """Horizontal force from outside on the vehicle, world axes (north, east).
 

@@ -23,7 +23,7 @@ class Control(enum.Enum):
     FAILSAFE = "failsafe"  # the autopilot says it is in an emergency
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class VehicleState:
     """Newest state of the vehicle and the age of each part (inf: never received)."""
 
@@ -44,7 +44,7 @@ class VehicleState:
     clock_error_s: float = float("inf")  # greatest error of the ages, by TIMESYNC; inf: they count from the arrival
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TendonState:
     """One tendon as its servo reports it."""
 
@@ -74,7 +74,7 @@ class CalibrationState(enum.IntEnum):
     VALID = 4
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Calibration:
     """The tendons' calibration as far as the mission cares."""
 
@@ -97,7 +97,7 @@ class Order(enum.Enum):
     FEEDFORWARD = "feedforward"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Request:
     """One accepted-for-consideration command; `id` ties the answer to whoever asked."""
 
@@ -117,7 +117,7 @@ class Result(enum.Enum):
     CANCELLED = "cancelled"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Answer:
     """What becomes of a request, with the reason in words for everything but success."""
 
@@ -137,7 +137,7 @@ class Severity(enum.IntEnum):
     INFO = 6
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Notice:
     """One sentence for people, sent as STATUSTEXT and logged."""
 
@@ -145,7 +145,7 @@ class Notice:
     text: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Bar:
     """A bar in the world: a point on its axis, the axis' direction (unit) and its radius."""
 
@@ -156,7 +156,7 @@ class Bar:
     direction_sigma: float | None = None  # rad, one sigma of the axis' direction; None: not told
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class GraspTarget:
     """An object in the world: where its grasp frame is, and how wide to wrap."""
 
@@ -174,7 +174,7 @@ class SetpointKind(enum.IntEnum):
     TIP = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ArmSetpoint:
     """Where a person or program streams the arm to; there is none any more once its time-out has passed."""
 
@@ -194,7 +194,7 @@ class ArmAction(enum.Enum):
     LIMP = "limp"  # torque off
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Setpoint:
     """Vehicle set-point in world axes (NED), always complete: both autopilots misread partial ones."""
 
@@ -264,7 +264,7 @@ class WrenchSource(enum.IntEnum):
     PAYLOAD = 3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class WrenchReport:
     """Predicted reaction wrench of the arm on the airframe, about its centre of mass, body axes (FRD)."""
 
@@ -278,7 +278,7 @@ class WrenchReport:
     residual: float  # of the model's equilibrium, relative; nan: none was solved
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StatusReport:
     """What the arm is doing, for ARM_STATUS."""
 
@@ -296,14 +296,14 @@ class StatusReport:
     calibration: CalibrationState = CalibrationState.UNKNOWN
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class StiffnessReport:
     """Tip compliance of the arm in its present pose: twist [linear; angular] per wrench [force; torque], body axes."""
 
     compliance_b: tuple[float, ...]  # upper triangle of the symmetric 6x6 matrix, row by row
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class PayloadReport:
     """Estimate of what the arm carries."""
 
@@ -314,7 +314,7 @@ class PayloadReport:
     valid: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Facts:
     """Everything that one step sees: the world as known at this cycle, with the age of each part."""
 
@@ -330,7 +330,7 @@ class Facts:
     calibration: Calibration = Calibration()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TensionEstimate:
     """Tension of one tendon from load and statics together."""
 
@@ -338,7 +338,7 @@ class TensionEstimate:
     sigma: float  # N
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Commands:
     """Everything that one step asks for."""
 

@@ -60,8 +60,11 @@ def dropped(s: Situation) -> str | None:
 def not_closed(s: Situation) -> str | None:
     """The arm is wrapped as far as allowed, yet no tendon carries the tension of a closed one."""
     perch = s.config.perch
-    around = s.state.bend == s.state.bend_goal
-    if not around or s.elapsed < perch.wrap_bend_rad / perch.bend_speed_rad_per_s + _SETTLE_S or closed(s) is not None:
+    if (
+        not s.at_bend_goal
+        or s.elapsed < perch.wrap_bend_rad / perch.bend_speed_rad_per_s + _SETTLE_S
+        or closed(s) is not None
+    ):
         return None
     return f"closed around nothing: {max(s.state.tension):.1f} N, {s.config.grasp.grip_tension_n:g} N are needed"
 
@@ -101,7 +104,7 @@ def takes_too_long(s: Situation) -> str | None:
 def closed(s: Situation) -> str | None:
     """Some tendon carries a closed arm's tension with the wrap complete."""
     most = max(s.state.tension)
-    done = s.state.bend == s.state.bend_goal and most >= s.config.grasp.grip_tension_n
+    done = s.at_bend_goal and most >= s.config.grasp.grip_tension_n
     return f"closed with {most:.1f} N" if done else None
 
 

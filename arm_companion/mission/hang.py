@@ -31,7 +31,6 @@ Ask = OrderRow[Phase, Situation]
 HUNG = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING})
 """Phases in which the arm carries more and more of the vehicle, or all that it shall."""
 
-_SHARING = sharing.SHARING
 _STOWED_ONLY = frozenset({Phase.STOWED})
 _IDLE_MARGIN = 0.2  # of hover thrust, by which the motors may idle higher than asked
 
@@ -134,9 +133,9 @@ ABORTS: tuple[Row, ...] = (
         for phases, guard, name, error in (
             (HUNG, pilot_takes_over, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
             (frozenset({Phase.TAKE_BACK}), taken_from_us, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
-            (_SHARING, failsafe, "autopilot failsafe", ArmFault.AUTOPILOT_FAILSAFE),
-            (_SHARING, vehicle_lost, "vehicle lost", ArmFault.VEHICLE_LOST),
-            (_SHARING, disarmed, "disarmed", ArmFault.DISARMED),
+            (sharing.SHARING, failsafe, "autopilot failsafe", ArmFault.AUTOPILOT_FAILSAFE),
+            (sharing.SHARING, vehicle_lost, "vehicle lost", ArmFault.VEHICLE_LOST),
+            (sharing.SHARING, disarmed, "disarmed", ArmFault.DISARMED),
         )
     ),
     *(

@@ -1,6 +1,5 @@
 """What the arm does to an airframe that hangs by it: the weight, less what the motors carry."""
 
-import dataclasses
 import math
 
 from arm_companion.arm.reaction import GRAVITY
@@ -8,6 +7,7 @@ from arm_companion.mission.facts import WrenchReport, WrenchSource
 from arm_companion.mission.motion import ZERO, unrotate
 from arm_companion.mission.sharing import motor_share
 from arm_companion.mission.situation import Situation
+from arm_companion.values import replace
 
 _THRUST_SPREAD = 0.1  # one sigma of thrust against throttle, relative
 _THROTTLE_SIGMA = 0.03  # of the hover's thrust: a throttle is told in whole per cent
@@ -38,7 +38,7 @@ def hung_wrench(s: Situation, report: WrenchReport, arm_mass: float) -> WrenchRe
     thrust = share * mass * GRAVITY
     down_sigma = math.hypot(_THRUST_SPREAD * thrust, _THROTTLE_SIGMA * mass * GRAVITY)
     torque_sigma = math.hypot(_ROTOR_ARM_M * thrust, _MOMENT_SIGMA)
-    return dataclasses.replace(
+    return replace(
         report,
         force_b=(x, y, z + thrust),
         torque_b=ZERO,

@@ -1,6 +1,5 @@
 """Jogging: single moves and streamed set-points, turned into goals that stay within the limits. Pure."""
 
-import dataclasses
 import math
 
 import numpy as np
@@ -9,6 +8,7 @@ from arm_companion.errors import CommandRejected, LimitViolated
 from arm_companion.mission.facts import Notice, Request, SetpointKind, Severity, Vec3
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, State
+from arm_companion.values import replace
 
 BEND, TIP, VEHICLE = 1, 2, 3
 """ARM_JOG_KIND."""
@@ -24,10 +24,10 @@ def jog(s: Situation, request: Request) -> State:
     if s.state.phase is Phase.PERCHED and kind == VEHICLE:
         if (size := math.hypot(x, y, z)) > s.config.perch.jog_max_m:
             raise CommandRejected(f"a move of {size:.3f} m is over {s.config.perch.jog_max_m:g} m")
-        return dataclasses.replace(s.state, offset=(x, y, z))
+        return replace(s.state, offset=(x, y, z))
     if s.state.phase is Phase.READY and kind in (BEND, TIP):
         goal = _bend(s, x, y) if kind == BEND else _bend_for_tip(s, (x, y, z))
-        return dataclasses.replace(s.state, bend_goal=goal, streamed=False)
+        return replace(s.state, bend_goal=goal, streamed=False)
     raise CommandRejected(f"jog kind {kind:g} is not possible in state {s.state.phase.name}")
 
 
@@ -38,9 +38,9 @@ def follow_stream(s: Situation, notices: list[Notice]) -> State:
     """
     state, wanted = s.state, s.facts.arm_setpoint
     if state.phase is not Phase.READY:
-        return dataclasses.replace(state, streamed=False) if state.streamed else state
+        return replace(state, streamed=False) if state.streamed else state
     if wanted is None:
-        return dataclasses.replace(state, bend_goal=state.bend, streamed=False) if state.streamed else state
+        return replace(state, bend_goal=state.bend, streamed=False) if state.streamed else state
     try:
         if wanted.kind is SetpointKind.TIP:
             goal = _bend_for_tip(s, wanted.tip_a)
@@ -51,8 +51,8 @@ def follow_stream(s: Situation, notices: list[Notice]) -> State:
         if _IGNORED in state.warned:
             return state
         notices.append(Notice(Severity.WARNING, reason))
-        return dataclasses.replace(state, warned=state.warned | {_IGNORED})
-    return dataclasses.replace(state, bend_goal=goal, streamed=True)
+        return replace(state, warned=state.warned | {_IGNORED})
+    return replace(state, bend_goal=goal, streamed=True)
 
 
 _IGNORED = "set-point ignored"

@@ -8,6 +8,7 @@ log and the operator see.
 import enum
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Generic, TypeVar
 
 from arm_companion.mission.facts import ArmFault, Order, Severity
@@ -85,10 +86,16 @@ class Table(Generic[P, S]):
     transitions: tuple[Transition[P, S], ...]
     orders: tuple[OrderRow[P, S], ...]
 
+    @cached_property
+    def _rows(self) -> dict[P, list[Transition[P, S]]]:
+        """The rows of each phase, in their order; most are of others."""
+        phases = frozenset[P]().union(*(row.sources for row in self.transitions))
+        return {phase: [row for row in self.transitions if phase in row.sources] for phase in phases}
+
     def next(self, phase: P, situation: S) -> tuple[Transition[P, S], str] | None:
         """The first row that fires in `phase`, with its reason."""
-        for row in self.transitions:
-            if phase in row.sources and (reason := row.guard(situation)) is not None:
+        for row in self._rows.get(phase, ()):
+            if (reason := row.guard(situation)) is not None:
                 return row, reason
         return None
 

@@ -1,7 +1,5 @@
 """The mission's step: a pure function from memory and facts to memory and commands."""
 
-import dataclasses
-
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
 from arm_companion.mission import actions, carry
@@ -20,7 +18,7 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
-from arm_companion.mission.notices import WARNINGS
+from arm_companion.mission.notices import TOLD_IN
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
@@ -29,6 +27,7 @@ from arm_companion.mission.state import PerchKind, Phase, Prediction, Running, S
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.vigil import keep_vigil
 from arm_companion.mission.wrench import predict
+from arm_companion.values import replace
 
 _CLEAR_TIMEOUT_S = 6.0
 _BESIDE = frozenset({Order.JOG, Order.FEEDFORWARD})  # orders that leave the running one alone
@@ -67,7 +66,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
     state, arm, pulls = actions.act(situation)
     situation = situation.remembering(state)
     prediction = predict(situation)
-    state = dataclasses.replace(
+    state = replace(
         _warn(situation, notices),
         t=t,
         prediction=prediction,
@@ -101,7 +100,7 @@ def _estimate(s: Situation) -> State:
     if state.phase is Phase.REACH:
         # the bar pushes the arm, and with it the vehicle, back
         force = time_above(tare(force, s.dt), (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
-    return dataclasses.replace(
+    return replace(
         state,
         force=force,
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
@@ -117,7 +116,7 @@ def _yield_to_pilot(s: Situation, notices: list[Notice]) -> Situation:
     if not (s.pilot_took_over and s.state.streaming):
         return s
     notices.append(Notice(Severity.NOTICE, f"set-points stopped: mode {s.facts.vehicle.mode}"))
-    return s.remembering(dataclasses.replace(s.state, streaming=False, reference=None))
+    return s.remembering(replace(s.state, streaming=False, reference=None))
 
 
 def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[Notice]) -> Situation:
@@ -125,7 +124,7 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
     name, phase, asked = request.order.name, s.state.phase, s
     try:
         if request.order is Order.PERCH:
-            asked = s.remembering(dataclasses.replace(s.state, kind=_kind(request)))
+            asked = s.remembering(replace(s.state, kind=_kind(request)))
         row = TABLE.order(request.order, phase)
         if row is None:
             raise CommandRejected(f"{name} is not possible in state {phase.name}")
@@ -140,7 +139,7 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
     s = s.remembering(jogged)
     if s.state.running is not None and request.order not in _BESIDE:
         answers.append(Answer(s.state.running.request, Result.CANCELLED, f"{name} ordered"))
-        s = s.remembering(dataclasses.replace(s.state, running=None))
+        s = s.remembering(replace(s.state, running=None))
     s = s.remembering(_settle(s.state, request))
     if row.target is not phase:
         aborted = ArmFault.OPERATOR_ABORT if request.order is Order.ABORT else ArmFault.NONE
@@ -149,22 +148,22 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
         answers.append(Answer(request.id, Result.ACCEPTED, progress=100))
         return s
     answers.append(Answer(request.id, Result.IN_PROGRESS, progress=0))
-    return s.remembering(dataclasses.replace(s.state, running=Running(request.id, request.order, row.done, s.t)))
+    return s.remembering(replace(s.state, running=Running(request.id, request.order, row.done, s.t)))
 
 
 def _settle(state: State, request: Request) -> State:
     """What an order changes in memory besides the phase."""
     match request.order:
         case Order.READY:
-            return dataclasses.replace(state, streaming=True, errors=ArmFault.NONE)
+            return replace(state, streaming=True, errors=ArmFault.NONE)
         case Order.PERCH:
-            return dataclasses.replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request))
+            return replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request))
         case Order.GRASP:
-            return dataclasses.replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR)
+            return replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR)
         case Order.CLEAR_ERRORS:  # a person has looked at the tendons
-            return dataclasses.replace(state, errors=ArmFault.NONE, watch=())
+            return replace(state, errors=ArmFault.NONE, watch=())
         case Order.FEEDFORWARD:
-            return dataclasses.replace(state, feedforward=bool(request.parameters[0]))
+            return replace(state, feedforward=bool(request.parameters[0]))
     return state
 
 
@@ -191,7 +190,7 @@ def _finish_clearing(s: Situation, answers: list[Answer]) -> Situation:
         answers.append(Answer(running.request, Result.FAILED, fault))
     else:
         return s
-    return s.remembering(dataclasses.replace(s.state, running=None))
+    return s.remembering(replace(s.state, running=None))
 
 
 def _move_on(s: Situation, answers: list[Answer], notices: list[Notice]) -> Situation:
@@ -211,14 +210,14 @@ def _move_on(s: Situation, answers: list[Answer], notices: list[Notice]) -> Situ
     else:
         answers.append(Answer(running.request, Result.IN_PROGRESS, reason, actions.progress(s)))
         return s
-    return s.remembering(dataclasses.replace(s.state, running=None))
+    return s.remembering(replace(s.state, running=None))
 
 
 def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error: ArmFault) -> Situation:
     """Change the phase: one notice with its cause, and the phase's own preparations."""
     severity = Severity.WARNING if error else Severity.INFO
     notices.append(Notice(severity, f"{s.state.phase.name} -> {phase.name}: {reason}"))
-    state = dataclasses.replace(
+    state = replace(
         s.state,
         phase=phase,
         since=s.t,
@@ -231,12 +230,12 @@ def _enter(s: Situation, phase: Phase, reason: str, notices: list[Notice], error
 def _warn(s: Situation, notices: list[Notice]) -> State:
     """Say once per phase what a person must know and no transition tells; what the reason counts may go on changing."""
     state = s.state
-    for told in WARNINGS:
+    for told in TOLD_IN[state.phase]:
         name = told.guard.__name__
-        if state.phase not in told.phases or name in state.warned or (reason := told.guard(s)) is None:
+        if name in state.warned or (reason := told.guard(s)) is None:
             continue
         notices.append(Notice(told.severity, f"{reason}; {told.consequence}" if told.consequence else reason))
-        state = dataclasses.replace(state, warned=state.warned | {name}, errors=state.errors | told.error)
+        state = replace(state, warned=state.warned | {name}, errors=state.errors | told.error)
     return state
 
 

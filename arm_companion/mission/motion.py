@@ -8,7 +8,7 @@ from arm_companion.mission.facts import Vec3
 ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Reference:
     """Where the vehicle is asked to be, world axes (NED)."""
 

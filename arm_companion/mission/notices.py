@@ -105,3 +105,6 @@ WARNINGS: tuple[Told, ...] = (
     Told(frozenset(Phase), overrun, Severity.WARNING, error=ArmFault.CYCLE_OVERRUN),
 )
 """What a person must know and no transition tells."""
+
+TOLD_IN = {phase: [told for told in WARNINGS if phase in told.phases] for phase in Phase}
+"""The same of each phase."""

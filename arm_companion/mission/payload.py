@@ -17,7 +17,7 @@ What is asked of the rotors passes one that is slower by their own lag.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import VehicleState
 from arm_companion.mission.motion import rotate
+from arm_companion.values import replace
 
 _POLE = 6.0  # rad/s, of the low-pass filter
 _ROTOR_LAG_S = 0.03  # from the thrust asked for to the thrust, as rotors of a foot have
@@ -46,7 +47,7 @@ _ENOUGH_S = 8.0  # of averaging, from which on the weight is known, and drift is
 Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Flow:
     """What the vehicle does with its thrust, each after the low-pass filter.
 
@@ -61,7 +62,7 @@ class Flow:
     sink: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class ThrustCurve:
     """What the rotors lift at a share of thrust, per kilogram of the vehicle.
 
@@ -109,13 +110,12 @@ class ThrustCurve:
 
     def learn(self, flow: Flow, felt: float, dt: float) -> "ThrustCurve":
         """The curve after `dt` seconds in which the rotors lifted the vehicle's mass by `felt` = g - dv/dt, m/s^2."""
-        h = self._regressor(flow)
-        P = np.array(self.covariance)
+        h, before, P = self._regressor(flow), np.array(self.theta), np.array(self.covariance)
         P[0, 0] += _DRIFT**2 * dt
         Ph = P @ h
         gain = Ph / (h @ Ph + _SPECTRUM / dt)
-        theta = np.array(self.theta) + gain * (felt - self.lift(flow))
-        P -= np.outer(gain, Ph)
+        theta = before + gain * (felt - float(h @ before))
+        P -= gain[:, None] * Ph
         return replace(self, theta=_three(theta), covariance=_rows(0.5 * (P + P.T)))
 
     def _regressor(self, flow: Flow) -> Array:
@@ -127,7 +127,7 @@ class ThrustCurve:
         return replace(self, covariance=((first[0] + _DRIFT**2 * dt, first[1], first[2]), rest[0], rest[1]))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Load:
     """The load on the arm, as far as thrust tells.
 
@@ -244,7 +244,8 @@ def _filtered(old: Flow, new: Flow, dt: float) -> Flow:
 
 
 def _three(v: Array) -> tuple[float, float, float]:
-    return float(v[0]), float(v[1]), float(v[2])
+    x, y, z = v.tolist()
+    return x, y, z
 
 
 def _rows(P: Array) -> Covariance:

@@ -80,7 +80,7 @@ def no_contact(s: Situation) -> str | None:
 
 def no_grip(s: Situation) -> str | None:
     """The arm is wrapped as far as allowed, yet no tendon carries a grip's tension."""
-    if not wrapped(s) or s.elapsed < s.config.perch.wrap_bend_rad / s.config.perch.bend_speed_rad_per_s + _SETTLE_S:
+    if not s.at_bend_goal or s.elapsed < s.config.perch.wrap_bend_rad / s.config.perch.bend_speed_rad_per_s + _SETTLE_S:
         return None
     if gripped(s) is not None or not wrapped_to_the_limit(s):
         return None
@@ -119,7 +119,7 @@ def pose_checked(s: Situation) -> str | None:
     ok = (
         s.elapsed > _SETTLE_S
         and all(tendon.torque for tendon in s.facts.tendons)
-        and s.state.bend == s.state.bend_goal
+        and s.at_bend_goal
         and s.bend_error < _POSE_CHECKED_RAD
     )
     return "pose checked" if ok else None
@@ -162,11 +162,6 @@ def settled_at_object(s: Situation) -> str | None:
     return contact_settled(s) if s.grasping else None
 
 
-def wrapped(s: Situation) -> bool:
-    """Whether the commanded bend has reached the full wrap."""
-    return s.state.bend == s.state.bend_goal
-
-
 def wrapped_to_the_limit(s: Situation) -> bool:
     """Whether the wrap must not bend any farther; in WRAP it goes on up to there while the grip is loose."""
     return norm((*s.state.bend, 0.0)) >= s.config.limits.bend_max_rad - _AT_LIMIT_RAD
@@ -175,7 +170,7 @@ def wrapped_to_the_limit(s: Situation) -> bool:
 def gripped(s: Situation) -> str | None:
     """Some tendon carries the grip tension with the wrap complete."""
     most = max(s.state.tension)
-    return f"gripped with {most:.1f} N" if wrapped(s) and most >= s.grip_needed else None
+    return f"gripped with {most:.1f} N" if s.at_bend_goal and most >= s.grip_needed else None
 
 
 def pull_test_share(s: Situation) -> float:
@@ -207,7 +202,7 @@ def unloaded(s: Situation) -> str | None:
 
 def unwrapped(s: Situation) -> str | None:
     """The arm is straight enough to leave."""
-    ok = s.state.bend == s.state.bend_goal and norm((*s.bend, 0.0)) < _CLEAR_BEND_RAD
+    ok = s.at_bend_goal and norm((*s.bend, 0.0)) < _CLEAR_BEND_RAD
     return "arm clear of the bar" if ok else None
 
 

@@ -45,49 +45,52 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
 def _flags(s: Situation) -> ArmFlag:
     """Facts that hold now."""
     vehicle, tendons, state = s.facts.vehicle, s.facts.tendons, s.state
-    held = {
-        ArmFlag.SERVOS_CONNECTED: bool(tendons) and not any(tendon.silent for tendon in tendons),
-        ArmFlag.TORQUE_ON: bool(tendons) and all(tendon.torque for tendon in tendons),
-        ArmFlag.CALIBRATED: s.facts.calibration.state is CalibrationState.VALID,
-        ArmFlag.VEHICLE_CONNECTED: vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s,
-        ArmFlag.VEHICLE_STATE_FRESH: s.vehicle_fresh,
-        ArmFlag.EXTERNAL_CONTROL: s.external,
-        ArmFlag.SETPOINTS_SENT: actions.setpoint(s) is not None,
-        ArmFlag.FEEDFORWARD: state.lean != ZERO
-        or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
-        ArmFlag.TARGET_KNOWN: (s.facts.grasp_target if s.grasping else s.facts.bar) is not None,
-        ArmFlag.CONTACT: state.phase in _TOUCHES,
-        ArmFlag.ANCHORED: state.phase in (Phase.PERCHED, Phase.HANGING),
-    }
-    return ArmFlag(sum(flag.value for flag, holds in held.items() if holds))
+    held = (
+        (ArmFlag.SERVOS_CONNECTED, bool(tendons) and not any(tendon.silent for tendon in tendons)),
+        (ArmFlag.TORQUE_ON, bool(tendons) and all(tendon.torque for tendon in tendons)),
+        (ArmFlag.CALIBRATED, s.facts.calibration.state is CalibrationState.VALID),
+        (ArmFlag.VEHICLE_CONNECTED, vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s),
+        (ArmFlag.VEHICLE_STATE_FRESH, s.vehicle_fresh),
+        (ArmFlag.EXTERNAL_CONTROL, s.external),
+        (ArmFlag.SETPOINTS_SENT, actions.setpoint(s) is not None),
+        (
+            ArmFlag.FEEDFORWARD,
+            state.lean != ZERO or (state.feedforward and state.phase is Phase.PERCHED and state.offset != ZERO),
+        ),
+        (ArmFlag.TARGET_KNOWN, (s.facts.grasp_target if s.grasping else s.facts.bar) is not None),
+        (ArmFlag.CONTACT, state.phase in _TOUCHES),
+        (ArmFlag.ANCHORED, state.phase in (Phase.PERCHED, Phase.HANGING)),
+    )
+    return ArmFlag(sum(flag for flag, holds in held if holds))
 
 
 def _present_faults(s: Situation) -> ArmFault:
     """Causes of failure that are there now, whether or not a row has acted on them."""
     vehicle, tendons = s.facts.vehicle, s.facts.tendons
-    there = {
-        ArmFault.VEHICLE_LOST: vehicle.heartbeat_age_s > s.config.vehicle.heartbeat_timeout_s,
-        ArmFault.VEHICLE_STATE_STALE: not s.vehicle_fresh,
-        ArmFault.AUTOPILOT_FAILSAFE: vehicle.control is Control.FAILSAFE,
-        ArmFault.SERVO_SILENT: any(tendon.silent for tendon in tendons),
-        ArmFault.ESTIMATOR_JUMP: hazards.estimator_jumped(s) is not None,
-        ArmFault.SETPOINT_REJECTED: hazards.astray(s) is not None,
-        ArmFault.GROUND_LOST: hazards.ground_lost(s) is not None,
-        ArmFault.OVERHEAT: hazards.hot(s) is not None,
-        ArmFault.OVERLOAD: any(tendon.error_bits & _OVERLOAD for tendon in tendons),
-        ArmFault.LOW_VOLTAGE: hazards.low_voltage(s) is not None,
-        ArmFault.MODEL: hazards.model_blind(s) is not None,
-        ArmFault.CYCLE_OVERRUN: hazards.overrun(s) is not None,
-        ArmFault.SERVO_FAULT: any(tendon.error_bits or not tendon.homed for tendon in tendons),
-        ArmFault.TENDON_SLACK: any(
-            t.torque and t.tension + 2.0 * t.tension_sigma < s.config.limits.tension_min_n for t in tendons
+    there = (
+        (ArmFault.VEHICLE_LOST, vehicle.heartbeat_age_s > s.config.vehicle.heartbeat_timeout_s),
+        (ArmFault.VEHICLE_STATE_STALE, not s.vehicle_fresh),
+        (ArmFault.AUTOPILOT_FAILSAFE, vehicle.control is Control.FAILSAFE),
+        (ArmFault.SERVO_SILENT, any(tendon.silent for tendon in tendons)),
+        (ArmFault.ESTIMATOR_JUMP, hazards.estimator_jumped(s) is not None),
+        (ArmFault.SETPOINT_REJECTED, hazards.astray(s) is not None),
+        (ArmFault.GROUND_LOST, hazards.ground_lost(s) is not None),
+        (ArmFault.OVERHEAT, hazards.hot(s) is not None),
+        (ArmFault.OVERLOAD, any(tendon.error_bits & _OVERLOAD for tendon in tendons)),
+        (ArmFault.LOW_VOLTAGE, hazards.low_voltage(s) is not None),
+        (ArmFault.MODEL, hazards.model_blind(s) is not None),
+        (ArmFault.CYCLE_OVERRUN, hazards.overrun(s) is not None),
+        (ArmFault.SERVO_FAULT, any(tendon.error_bits or not tendon.homed for tendon in tendons)),
+        (
+            ArmFault.TENDON_SLACK,
+            any(t.torque and t.tension + 2.0 * t.tension_sigma < s.config.limits.tension_min_n for t in tendons),
         ),
-        ArmFault.TENDON_BROKEN: any(watched.broken for watched in s.state.watch),
-        ArmFault.TENSION_DISAGREES: any(watched.jumped for watched in s.state.watch),
-        ArmFault.NOT_CALIBRATED: bool(s.facts.calibration.refusal),
-        ArmFault.TENDON_OVER_TENSION: any(t.tension > s.config.limits.tension_max_n for t in tendons),
-    }
-    return ArmFault(sum(fault.value for fault, present in there.items() if present))
+        (ArmFault.TENDON_BROKEN, any(watched.broken for watched in s.state.watch)),
+        (ArmFault.TENSION_DISAGREES, any(watched.jumped for watched in s.state.watch)),
+        (ArmFault.NOT_CALIBRATED, bool(s.facts.calibration.refusal)),
+        (ArmFault.TENDON_OVER_TENSION, any(t.tension > s.config.limits.tension_max_n for t in tendons)),
+    )
+    return ArmFault(sum(fault for fault, present in there if present))
 
 
 def _polar(u: tuple[float, float]) -> tuple[float, float]:

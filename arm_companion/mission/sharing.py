@@ -6,13 +6,12 @@ really do is read from their throttle, since an autopilot's idea of its hover th
 carries it. docs/adr/0018 says why neither a lowered position nor a disarm is used.
 """
 
-import dataclasses
-
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Vec3
 from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, norm, ramp, scale, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Sharing, State
+from arm_companion.values import replace
 
 SHARING = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK})
 """Phases in which we say how much of the weight the motors carry."""
@@ -64,12 +63,12 @@ def keep_sharing(s: Situation) -> Sharing:
     load, vehicle, hang = s.state.sharing, s.facts.vehicle, s.config.hang
     if s.state.phase in _HOVERING and throttle_known(s) and vehicle.armed and not vehicle.landed:
         share = s.dt / (_HOVER_S + s.dt) if load.hover > 0.0 else 1.0
-        return dataclasses.replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
+        return replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
     if s.state.phase not in SHARING:
         return load
     away = sub(s.state.position, load.place)
     rests = load.share == load.step and norm(away) < hang.rest_m
-    return dataclasses.replace(
+    return replace(
         load,
         place=add(load.place, scale(away, s.dt / (_PLACE_S + s.dt))),
         rested_s=load.rested_s + s.dt if rests else 0.0,
@@ -96,19 +95,19 @@ def carried(s: Situation) -> bool:
 def begin(s: Situation) -> State:
     """Memory at the entry of the present phase, which is one of SUSPENDED."""
     state, load, position = s.state, s.state.sharing, s.state.position
-    fresh = dataclasses.replace(load, rested_s=0.0, carried_s=0.0)
+    fresh = replace(load, rested_s=0.0, carried_s=0.0)
     match state.phase:
         case Phase.LOAD_TRANSFER:
-            load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0, place=position, first=position[2])
+            load = replace(fresh, share=1.0, step=1.0, trim=0.0, place=position, first=position[2])
             rest = add(s.probe, (0.0, 0.0, _BELOW_GRIP_M))
-            return dataclasses.replace(state, sharing=_next_step(s, load, -1.0), rest=rest)
+            return replace(state, sharing=_next_step(s, load, -1.0), rest=rest)
         case Phase.TAKE_BACK:
-            load = dataclasses.replace(fresh, place=position, first=position[2])
-            return dataclasses.replace(state, sharing=_next_step(s, load, 1.0))
+            load = replace(fresh, place=position, first=position[2])
+            return replace(state, sharing=_next_step(s, load, 1.0))
         case Phase.HANG_HOLD:
-            load = dataclasses.replace(fresh, share=1.0, step=1.0, trim=0.0)
-            return dataclasses.replace(state, sharing=load, bend=s.bend, bend_goal=s.bend, pulls=())
-    return dataclasses.replace(state, sharing=fresh)
+            load = replace(fresh, share=1.0, step=1.0, trim=0.0)
+            return replace(state, sharing=load, bend=s.bend, bend_goal=s.bend, pulls=())
+    return replace(state, sharing=fresh)
 
 
 def share_on(s: Situation) -> Sharing:
@@ -118,7 +117,7 @@ def share_on(s: Situation) -> Sharing:
         return load
     urgent = s.state.phase is Phase.TAKE_BACK and bool(s.state.errors)
     if urgent:
-        load = dataclasses.replace(load, step=1.0)
+        load = replace(load, step=1.0)
     elif load.rested_s >= hang.rest_s and s.state.phase is not Phase.HANGING:
         load = _next_step(s, load, -1.0 if s.state.phase is Phase.LOAD_TRANSFER else 1.0)
     share = ramp(load.share, load.step, hang.share_per_s * (_URGENT if urgent else 1.0), s.dt)
@@ -127,7 +126,7 @@ def share_on(s: Situation) -> Sharing:
         trim = 0.0
     elif (measured := motor_share(s)) is not None:
         trim += _TRIM_PER_S * (measured - share) * GRAVITY * s.dt
-    return dataclasses.replace(load, share=share, trim=min(max(trim, -_TRIM_MAX), _TRIM_MAX))
+    return replace(load, share=share, trim=min(max(trim, -_TRIM_MAX), _TRIM_MAX))
 
 
 def _next_step(s: Situation, load: Sharing, way: float) -> Sharing:
@@ -139,7 +138,7 @@ def _next_step(s: Situation, load: Sharing, way: float) -> Sharing:
         step = hang.idle_share
     elif step > 1.0 - 0.5 * stride:
         step = 1.0
-    return load if step == load.step else dataclasses.replace(load, step=step, rested_s=0.0)
+    return load if step == load.step else replace(load, step=step, rested_s=0.0)
 
 
 def unloading(s: Situation) -> Vec3:

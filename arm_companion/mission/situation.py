@@ -1,6 +1,5 @@
 """One cycle as the guards and actions see it: facts, memory, parameters and what follows from them."""
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,10 +15,10 @@ from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Order, Vec3
 from arm_companion.mission.motion import ZERO, add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
+from arm_companion.values import replace
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
-_FROM_FACTS = frozenset({"gravity_a", "bend"})
 
 
 @dataclass(frozen=True)
@@ -66,7 +65,7 @@ class Parameters:
 
 @dataclass(frozen=True)
 class Situation:
-    """Facts, memory and parameters of one cycle."""
+    """Facts, memory and parameters of one cycle; only what does not depend on memory is cached."""
 
     state: State
     facts: Facts
@@ -74,13 +73,10 @@ class Situation:
     parameters: Parameters
 
     def remembering(self, state: State) -> "Situation":
-        """The same cycle with other memory; what follows from the facts alone is not computed again."""
-        other = dataclasses.replace(self, state=state)
-        for name in _FROM_FACTS & self.__dict__.keys():
-            other.__dict__[name] = self.__dict__[name]
-        return other
+        """The same cycle with other memory; the cached properties, which follow from the facts alone, go along."""
+        return replace(self, state=state)
 
-    @property
+    @cached_property
     def config(self) -> Config:
         """The whole configuration."""
         return self.parameters.config
@@ -97,7 +93,7 @@ class Situation:
 
     # --- the vehicle ---
 
-    @property
+    @cached_property
     def vehicle_fresh(self) -> bool:
         """Whether position and attitude are new enough to act on."""
         v = self.facts.vehicle
@@ -182,6 +178,11 @@ class Situation:
         return float(u[0]), float(u[1])
 
     @property
+    def at_bend_goal(self) -> bool:
+        """Whether the commanded bend has come to its goal: in a wrap the full one, in a release the straight arm."""
+        return self.state.bend == self.state.bend_goal
+
+    @property
     def bend_error(self) -> float:
         """Distance between commanded and measured bend, rad."""
         return math.hypot(self.bend[0] - self.state.bend[0], self.bend[1] - self.state.bend[1])
@@ -225,7 +226,7 @@ class Situation:
         vigil = self.state.vigil
         if vigil.shift == ZERO or self.t - age > vigil.jumped_at:  # nothing jumped since it was told
             return bar
-        return dataclasses.replace(bar, point_w=add(bar.point_w, vigil.shift))
+        return replace(bar, point_w=add(bar.point_w, vigil.shift))
 
     def base_offset_w(self, yaw: float) -> Vec3:
         """From the vehicle's centre of mass to the arm's base while it hovers at `yaw`, world axes."""
@@ -282,9 +283,17 @@ class Situation:
 
         The outer tendon keeps the least tension, the inner has twice the bend's moment on top (model.md).
         """
-        arm, perch = self.parameters.model.parameters, self.config.perch
+        perch = self.config.perch
         beyond = max(math.hypot(*self.state.bend) - perch.wrap_bend_rad, 0.0)
-        return perch.grip_tension_n + beyond * arm.EI / (arm.r * arm.L)
+        return perch.grip_tension_n + 2.0 * self.tension_swing(beyond)
+
+    def tension_swing(self, theta: float) -> float:
+        """By how much a free bend `theta`, rad, tightens its inner tendon and slackens its outer one, N (model.md).
+
+        tau_i = T0 + swing cos(phi_i - delta).
+        """
+        arm = self.parameters.model.parameters
+        return theta * arm.EI / (2.0 * arm.r * arm.L)
 
     @property
     def probe(self) -> Vec3:

@@ -39,6 +39,8 @@ class Phase(enum.Enum):
     TAKE_BACK = 23
     HANG_HOLD = 24
 
+    __hash__ = object.__hash__  # an enumeration's own takes longer than the look-up, dozens of times in a cycle
+
 
 CARRYING = frozenset({Phase.LIFT, Phase.CARRY, Phase.PLACE})
 """Phases in which the vehicle alone holds up what the arm holds."""
@@ -63,7 +65,7 @@ MOVES_VEHICLE = CARRYING | frozenset(
 """Phases whose set-points the vehicle must follow."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Running:
     """The order that is being carried out, and where it ends."""
 
@@ -73,7 +75,7 @@ class Running:
     since: float = 0.0  # loop time
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Anchor:
     """Vehicle and arm at the moment when the grip was taken for good.
 
@@ -94,7 +96,7 @@ class Anchor:
     beyond: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Prediction:
     """What the arm's mechanics say, found anew a few times while the cycle runs."""
 
@@ -114,7 +116,7 @@ FOLLOWS = CARRYING | frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
 """Phases in which nothing but air is between the vehicle and its reference."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Vigil:
     """For how long each doubtful fact has held, s, and where the vehicle was in the cycle before.
 
@@ -150,7 +152,7 @@ class PerchKind(enum.Enum):
     HANG = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Sharing:
     """How arm and motors share the vehicle's weight while it hangs, or is about to.
 
@@ -175,7 +177,7 @@ class Sharing:
     first: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class State:
     """Memory of the mission: plain values, so that a record holds all of it."""
 

@@ -5,16 +5,17 @@ that is many sigma large and stays: noise is averaged away, friction and the mod
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from arm_companion.config.schema import LimitsConfig
 from arm_companion.mission.facts import TendonState
+from arm_companion.values import replace
 
 _SMOOTHING_S = 0.3
 _GONE_SHARE = 0.4  # of the expected tension, under which a tendon does not pull any more
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Expected:
     """What the statics say of one tendon.
 
@@ -29,7 +30,7 @@ class Expected:
     exact: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TendonWatch:
     """One tendon under suspicion.
 

@@ -1,12 +1,12 @@
 """What has to last before it counts: how long each doubtful fact has held, and jumps of the vehicle's position."""
 
 import math
-from dataclasses import replace
 
 from arm_companion.mission.facts import Vec3
 from arm_companion.mission.motion import add, norm, scale, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import FOLLOWS, State
+from arm_companion.values import replace
 
 HEAT_MARGIN_K = 7.0
 """A servo is called hot by so much before it lets go."""

@@ -2,7 +2,6 @@
 
 import math
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,6 +13,7 @@ from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
+from arm_companion.geometry.wrench import rotation_matrix
 from arm_companion.mission import carry
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.hung_wrench import hung_wrench
@@ -22,6 +22,7 @@ from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
+from arm_companion.values import replace
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = CARRYING | SUSPENDED | frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE, Phase.HOLDING})
@@ -35,6 +36,7 @@ _FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes; down, where the thrust is not kn
 _SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides
 _MOMENT_SIGMA = 0.15  # N m, of what the bar passes on besides the force
 _SPREAD = Spread(hold_position=0.005, hold_rotation=0.03)
+_UPPER = np.triu_indices(6)
 _NAN3: Vec3 = (math.nan, math.nan, math.nan)
 
 
@@ -47,13 +49,8 @@ def predict(s: Situation) -> Prediction:
     period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
     if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
         return last
-    free = held = None
-    with suppress(ModelError):
-        free = _free(s, None if last is None else last.free)
-    holding = s.state.phase in _ANCHORED and s.state.anchor is not None and not s.grasping
-    if holding:
-        with suppress(ModelError):
-            held = anchored(s, s.state.position, None if last is None else last.anchored)
+    free, held = equilibria(s)
+    holding = _holding(s)
     solution = held if holding else free
     tip = _NAN3 if free is None else _vec3(free.tip_position)
     return Prediction(
@@ -67,6 +64,23 @@ def predict(s: Situation) -> Prediction:
         held,
         _stiffness(s, solution),
     )
+
+
+def equilibria(s: Situation) -> tuple[ArmSolution | None, ArmSolution | None]:
+    """The free arm, and the anchored one while something is; each from the last one on, None where none was found."""
+    last = s.state.prediction
+    free = held = None
+    with suppress(ModelError):
+        free = _free(s, None if last is None else last.free)
+    if _holding(s):
+        with suppress(ModelError):
+            held = anchored(s, s.state.position, None if last is None else last.anchored)
+    return free, held
+
+
+def _holding(s: Situation) -> bool:
+    """Whether the arm is an anchor for the vehicle."""
+    return s.state.phase in _ANCHORED and s.state.anchor is not None and not s.grasping
 
 
 def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:
@@ -273,10 +287,10 @@ def _stiffness(s: Situation, solution: ArmSolution | None) -> StiffnessReport | 
         C = solution.compliance
     except ModelError:
         return None
-    R = np.kron(np.eye(2), s.mount.rotation)
+    R = rotation_matrix(s.mount)
     C = R @ C @ R.T
     C = 0.5 * (C + C.T)
-    return StiffnessReport(tuple(float(c) for c in C[np.triu_indices(6)]))
+    return StiffnessReport(tuple(C[_UPPER].tolist()))
 
 
 def _nothing(source: WrenchSource) -> WrenchReport:
@@ -297,4 +311,5 @@ def _report(found: Reaction, source: WrenchSource, *, valid: bool) -> WrenchRepo
 
 
 def _vec3(v: Array) -> Vec3:
-    return float(v[0]), float(v[1]), float(v[2])
+    x, y, z = v.tolist()
+    return x, y, z
