@@ -59,6 +59,10 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
             f"{_mm(move.made_m)} made",
             f"asked {_mm(move.asked_m)}, error {_mm(move.error_m)}, arm's force {move.force_n:.1f} N",
         )
+    if not math.isnan(verdict.excursion_m):
+        table.add_row(
+            "excursion after release", _mm(verdict.excursion_m), "greatest distance from where it was asked to be"
+        )
     if isinstance(verdict, GraspVerdict):
         _show_grasp(verdict, table)
     console.print(table)
