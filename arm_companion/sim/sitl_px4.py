@@ -15,6 +15,7 @@ from typing import Any
 
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.capture import Capture
 from arm_companion.sim.ports import RigidState, RotorCommand, Vec3
 from arm_companion.sim.rotors import LAYOUT, Rotors
 
@@ -39,6 +40,7 @@ class Px4Bridge:
         mass: of the whole vehicle, kg.
         seed: of the sensors' noise.
         address: where PX4 connects.
+        capture: tells it where it is; None: satellites and barometer alone do.
 
     Attributes:
         frames: HIL_ACTUATOR_CONTROLS taken.
@@ -52,11 +54,14 @@ class Px4Bridge:
     period_s = 0.004
     """Of the turns: PX4 expects the sensors at 250 Hz."""
 
-    def __init__(self, mass: float, seed: int, address: tuple[str, int] = ("127.0.0.1", PORT)) -> None:
+    def __init__(
+        self, mass: float, seed: int, address: tuple[str, int] = ("127.0.0.1", PORT), capture: Capture | None = None
+    ) -> None:
         self.frames = self.malformed = self.boots = 0
         self._rotors = Rotors(mass)
         self._throttles: Sequence[float] = (0.0,) * len(LAYOUT)
         self._rng = random.Random(seed)  # noqa: S311 - a simulation, repeatable by design
+        self._capture = capture
         self._t = _START_S
         self._turns = 0
         self._waiting = False
@@ -117,6 +122,8 @@ class Px4Bridge:
         """
         self._t += dt
         self._turns += 1
+        if self._capture is not None and (pose := self._capture.message(state, self._t, dt)) is not None:
+            self._send(pose)  # before the sensors, which it belongs to: they give PX4 its turn
         for message in self._messages(state):
             self._send(message)
         self._waiting = self._connection is not None

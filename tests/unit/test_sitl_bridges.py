@@ -3,9 +3,12 @@
 import itertools
 import json
 import math
+import select
 import socket
+import statistics
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,6 +17,7 @@ from hypothesis import strategies as st
 
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.capture import Capture, CaptureLine
 from arm_companion.sim.flight_control import Airframe, Estimate, FlightController, MotionSetpoint
 from arm_companion.sim.ports import RigidState
 from arm_companion.sim.rotors import ARM_M, LAG_S, LAYOUT, THRUST_TO_WEIGHT, TORQUE_PER_THRUST_M, Rotors
@@ -458,3 +462,47 @@ def test_a_body_is_flown_through_px4s_interface(px4: tuple[Px4Bridge, FakePx4]) 
         peer.controls(tuple(stack.motors(estimate, bridge.period_s)))
         assert bridge.answered(WAIT_S)
     arrives(body, stack)
+
+
+# Motion capture --------------------
+
+
+def test_motion_capture_tells_where_the_vehicle_is_50_times_a_second_within_its_noise() -> None:
+    turned = (math.cos(0.4), 0.0, 0.0, math.sin(0.4))
+    state = RigidState((3.0, 4.0, -10.0), (0.0, 0.0, 0.0), turned, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81))
+    capture = Capture(1, 0.004)
+    told = [m for i in range(5000) if (m := capture.message(state, 0.002 * i, 0.002)) is not None]
+    assert len(told) == 500
+    assert {b.usec - a.usec for a, b in itertools.pairwise(told)} == {20_000}
+    away = [math.dist((m.x, m.y, m.z), state.position_w) for m in told]
+    assert 0.001 < statistics.median(away) < 0.02
+    assert told[0].yaw == pytest.approx(0.8, abs=0.02)
+
+
+def test_px4_hears_motion_capture_beside_its_sensors() -> None:
+    bridge = Px4Bridge(MASS, 1, ("127.0.0.1", 0), Capture(1, 0.0))
+    peer = FakePx4(bridge.address[1])
+    try:
+        assert bridge.answered(WAIT_S)
+        for _ in range(5):
+            bridge.control(replace(STILL, position_w=(1.0, 2.0, -3.0)), bridge.period_s)
+        message = peer.hear("VISION_POSITION_ESTIMATE")
+        assert (message.x, message.y, message.z) == (1.0, 2.0, -3.0)
+    finally:
+        peer.close()
+        bridge.close()
+
+
+def test_ardupilot_hears_motion_capture_on_a_line_of_its_own_once_it_has_spoken_there() -> None:
+    line = CaptureLine(Capture(1, 0.0))
+    codec = mav.MAVLink(None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as serial:
+        serial.settimeout(WAIT_S)
+        line.tell(STILL, 1.0, 0.02)  # to nobody
+        serial.sendto(b"heartbeat", ("127.0.0.1", line.port))
+        select.select([], [], [], 0.05)
+        line.tell(replace(STILL, position_w=(1.0, 2.0, -3.0)), 1.02, 0.02)
+        (message,) = codec.parse_buffer(serial.recv(4096))
+    line.close()
+    assert message.usec == 1_020_000
+    assert (message.x, message.y, message.z) == (1.0, 2.0, -3.0)
