@@ -156,6 +156,13 @@ class SimConfig:
     position_noise_m: float = option(
         "noise of the stand-in's estimate, and of motion capture, one sigma", 0.004, unit="m", lower=0.0, upper=1.0
     )
+    position_wander_m: float = option(
+        "slow wandering of the stand-in's position on top, as by satellites and a barometer (0.02), one sigma",
+        0.0,
+        unit="m",
+        lower=0.0,
+        upper=1.0,
+    )
     sitl_position: str = option(
         "where a real flight stack knows its position from: motion capture, or satellites and barometer",
         "capture",

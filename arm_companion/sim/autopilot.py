@@ -65,7 +65,7 @@ class AutopilotStandIn:
         scale = 1.0 + self._rng.uniform(-_HOVER_THRUST_ERROR, _HOVER_THRUST_ERROR)
         frame = Airframe(mass, (north, east, down), scale, thrust_curve=config.sim.thrust_curve)
         self._controller = (FlightController if self._flavour.is_px4 else ArdupilotController)(frame)
-        self._estimator = Estimator(self._rng, config.sim.position_noise_m)
+        self._estimator = Estimator(self._rng, config.sim.position_noise_m, config.sim.position_wander_m)
         self._battery = Battery()
         defaults = dict(self._flavour.parameters)
         if TAKEOFF_ALTITUDE in defaults:

@@ -119,8 +119,6 @@ class ArdupilotBridge:
     def close(self) -> None:
         """Leave the port."""
         self._socket.close()
-        if self._capture is not None:
-            self._capture.close()
 
     def answered(self, within_s: float) -> bool:
         """Whether SITL has had its turn; waits for it for so long, at most.

@@ -23,7 +23,8 @@ from arm_companion.config import Config, load
 from arm_companion.errors import ConfigError, LinkError
 from arm_companion.sim import sitl, sitl_ardupilot
 from arm_companion.sim.ports import RigidState
-from arm_companion.sim.sitl import Relay, Sitl, SitlFailed
+from arm_companion.sim.sitl import Sitl, SitlFailed
+from arm_companion.sim.sitl_relay import Relay
 from arm_companion.sim.world import World
 from arm_companion.transport.memory import MemoryPipe
 
