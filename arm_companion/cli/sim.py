@@ -277,13 +277,16 @@ def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, pre
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:
     from arm_companion.clock import precise_loop  # noqa: PLC0415
+    from arm_companion.sim.asked import asked  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         log = arguments.output / "daemon.log"
-        return runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly, flown_by=stack))
+        result = runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly, flown_by=stack))
+    result.flight.asked = asked(_record_path(arguments))
+    return result
 
 
 def _daemon_words(arguments: argparse.Namespace) -> list[str]:
@@ -311,6 +314,7 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "pose_error_with_m": _number(errors.get("pull x", math.nan)),
         "pose_error_without_m": _number(errors.get("pull x, not compensated", math.nan)),
         "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],
+        "excursion_after_release_m": _number(verdict.excursion_m),
         "cycles": result.cycles,
         "missed_cycles": result.missed,
         "lost_s": round(result.lost_s, 3),

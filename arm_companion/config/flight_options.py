@@ -171,7 +171,21 @@ class SimConfig:
         lower=0.0,
         upper=0.9,
     )
-    position_noise_m: float = option("estimator noise, one sigma", 0.004, unit="m", lower=0.0, upper=1.0)
+    position_noise_m: float = option(
+        "noise of the stand-in's estimate, and of motion capture, one sigma", 0.004, unit="m", lower=0.0, upper=1.0
+    )
+    position_wander_m: float = option(
+        "slow wandering of the stand-in's position on top, as by satellites and a barometer (0.02), one sigma",
+        0.0,
+        unit="m",
+        lower=0.0,
+        upper=1.0,
+    )
+    sitl_position: str = option(
+        "where a real flight stack knows its position from: motion capture, or satellites and barometer",
+        "capture",
+        choices=("capture", "satellites"),
+    )
     wind_m_per_s: tuple[float, ...] = option(
         "steady wind, NED", (0.0, 0.0, 0.0), unit="m/s", lower=-30.0, upper=30.0, length=3
     )

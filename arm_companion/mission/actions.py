@@ -288,8 +288,10 @@ def _beside_bar(s: Situation) -> Vec3:
     closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
         closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
-    # forward first, while the curl is still wide
-    ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / _FORWARD_SHARE, 0.0))
+    # forward first, while the curl is still wide; and away from the bar before anything can hook into it
+    leaves = state.phase is Phase.RELEASE and not s.grasping and state.kind is PerchKind.ANCHOR
+    forward = 1.0 if leaves else _FORWARD_SHARE
+    ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / forward, 0.0))
     return add(add(s.state.contact_w, scale(sub(closed, s.state.contact_w), share)), ahead)
 
 

@@ -143,7 +143,7 @@ def slack(s: Situation) -> str | None:
 
 
 def model_blind(s: Situation) -> str | None:
-    """The mechanics have no solution: nothing is fed forward, and the wrench is not valid."""
+    """The mechanics have no solution: the wrench is not valid, and moves are made with the last stiffness."""
     return "the arm's mechanics have no solution" if s.state.vigil.blind_s > _BLIND_S else None
 
 

@@ -100,7 +100,7 @@ WARNINGS: tuple[Told, ...] = (
         ArmFault.SETPOINT_REJECTED,
     ),
     Told(frozenset(Phase), slack, Severity.WARNING),
-    Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "nothing is fed forward"),
+    Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "a held arm's last stiffness stays"),
     Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, ground_lost, Severity.WARNING, "the autopilot decides"),
     Told(frozenset(Phase), overrun, Severity.WARNING, error=ArmFault.CYCLE_OVERRUN),
 )

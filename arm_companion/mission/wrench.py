@@ -31,6 +31,7 @@ _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
 _HELD_TENSION_SIGMA = 1.0  # N, on top of it
 _LEAST_HZ = 5.0
+_RETRY_S = 0.25
 # the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
 _FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes; down, where the thrust is not known
 _SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides
@@ -43,39 +44,47 @@ _NAN3: Vec3 = (math.nan, math.nan, math.nan)
 def predict(s: Situation) -> Prediction:
     """The newest prediction: the last one while it is young, else a new one.
 
-    Mechanics take milliseconds, so they run at the rate of ARM_REACTION_WRENCH and at each change of phase.
+    Mechanics take milliseconds, so they run at the rate of ARM_REACTION_WRENCH and at each change of phase. To find
+    that an anchored arm has no equilibrium takes a hundred times as long, so then they are asked less often, each time
+    from the last equilibrium that there was. Its stiffness goes on saying what a move takes: an estimated position that
+    wanders off by more than the arm could bear says nothing about the arm.
     """
     last = s.state.prediction
     period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
+    if last is not None and last.wrench.source is WrenchSource.ANCHORED and math.isnan(last.wrench.force_b[0]):
+        period = max(period, _RETRY_S)
     if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
         return last
-    free, held = equilibria(s)
+    free, known, found = equilibria(s)
     holding = _holding(s)
-    solution = held if holding else free
+    solution = (known if found else None) if holding else free
     tip = _NAN3 if free is None else _vec3(free.tip_position)
     return Prediction(
         s.t,
         _wrench(s, solution, holding=holding),
         tip,
         s.bend,
-        _lean(s, solution),
+        _lean(s, known),
         _tensions(s, free),
         free,
-        held,
+        known,
         _stiffness(s, solution),
     )
 
 
-def equilibria(s: Situation) -> tuple[ArmSolution | None, ArmSolution | None]:
-    """The free arm, and the anchored one while something is; each from the last one on, None where none was found."""
+def equilibria(s: Situation) -> tuple[ArmSolution | None, ArmSolution | None, bool]:
+    """The free arm, None where none was found; the last anchored one while something is, and whether it is of now."""
     last = s.state.prediction
-    free = held = None
+    free = None
     with suppress(ModelError):
         free = _free(s, None if last is None else last.free)
-    if _holding(s):
-        with suppress(ModelError):
-            held = anchored(s, s.state.position, None if last is None else last.anchored)
-    return free, held
+    if not _holding(s):
+        return free, None, False
+    known = None if last is None else last.anchored
+    try:
+        return free, anchored(s, s.state.position, known), True
+    except ModelError:
+        return free, known, False
 
 
 def _holding(s: Situation) -> bool:

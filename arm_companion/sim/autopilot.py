@@ -27,7 +27,7 @@ from arm_companion.sim.autopilot_telemetry import Battery, Telemetry
 from arm_companion.sim.estimator import Estimator
 from arm_companion.sim.flight_control import Airframe, Estimate, FlightController
 from arm_companion.sim.mavlink_router import SYSTEM, Port, Router, RouterCounters
-from arm_companion.sim.ports import RigidState, RotorCommand, Vec3
+from arm_companion.sim.ports import RigidState, RotorCommand
 from arm_companion.transport.base import Opener
 
 _HOVER_THRUST_ERROR = 0.05
@@ -65,7 +65,7 @@ class AutopilotStandIn:
         scale = 1.0 + self._rng.uniform(-_HOVER_THRUST_ERROR, _HOVER_THRUST_ERROR)
         frame = Airframe(mass, (north, east, down), scale, thrust_curve=config.sim.thrust_curve)
         self._controller = (FlightController if self._flavour.is_px4 else ArdupilotController)(frame)
-        self._estimator = Estimator(self._rng, config.sim.position_noise_m)
+        self._estimator = Estimator(self._rng, config.sim.position_noise_m, config.sim.position_wander_m)
         self._battery = Battery()
         defaults = dict(self._flavour.parameters)
         if TAKEOFF_ALTITUDE in defaults:
@@ -178,15 +178,6 @@ class AutopilotStandIn:
     def estimate(self) -> Estimate:
         """The estimator's present idea of the motion."""
         return self._modes.estimate
-
-    @property
-    def asked_w(self) -> Vec3 | None:
-        """Position that is flown to, m; None where none is, or not in all axes."""
-        flown = self._modes.flown
-        if flown is None:
-            return None
-        x, y, z = flown.position_w
-        return None if x is None or y is None or z is None else (x, y, z)
 
     @property
     def counters(self) -> RouterCounters:

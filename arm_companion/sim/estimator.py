@@ -14,6 +14,7 @@ from arm_companion.sim.ports import RigidState
 _PERIOD_S = 0.01
 _REFERENCE_NOISE_M = 0.004
 _MOST_SCALE = 3.0
+_WANDER_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,10 +30,21 @@ class Estimator:
 
     At 4 mm position noise: velocity 10 mm/s, attitude 2 mrad, rates 1 mrad/s, accelerometer 0.05 m/s^2; at most
     three times that, since inertial sensors do not get worse with the position fix. Zero noise gives the truth.
+
+    What satellites and a barometer do to a real flight stack's estimate comes on top: a position that wanders within
+    seconds, and a velocity that shows nothing of it.
+
+    Args:
+        rng: draws the errors.
+        position_noise_m: one sigma.
+        wander_m: of the wandering, one sigma.
     """
 
-    def __init__(self, rng: random.Random, position_noise_m: float) -> None:
+    def __init__(self, rng: random.Random, position_noise_m: float, wander_m: float = 0.0) -> None:
         self._rng = rng
+        self._wander = [0.0, 0.0, 0.0]
+        self._wander_keep = math.exp(-_PERIOD_S / _WANDER_S)
+        self._wander_kick = wander_m * math.sqrt(1.0 - self._wander_keep**2)
         scale = min(position_noise_m / _REFERENCE_NOISE_M, _MOST_SCALE)
         kinds = (
             _Wander(0.8 * position_noise_m, 20.0),  # drift of the position; with the next one sigma in all
@@ -46,7 +58,7 @@ class Estimator:
         sigmas = [kind.sigma for kind in kinds for _ in range(3)]
         self._kick = [s * math.sqrt(1.0 - k * k) for s, k in zip(sigmas, self._keep, strict=True)]
         self._error = [rng.gauss(0.0, s) for s in sigmas]
-        self._quiet = position_noise_m == 0.0
+        self._quiet = position_noise_m == 0.0 and wander_m == 0.0
         self._since = 0.0
 
     def update(self, state: RigidState, dt: float) -> Estimate:
@@ -61,7 +73,9 @@ class Estimator:
                 keep * error + kick * gauss(0.0, 1.0)
                 for keep, error, kick in zip(self._keep, self._error, self._kick, strict=True)
             ]
-        e = self._error
+            if self._wander_kick:  # drawn only where there is any: the same seed gives the same flight without
+                self._wander = [self._wander_keep * w + self._wander_kick * gauss(0.0, 1.0) for w in self._wander]
+        e, far = self._error, self._wander
         p, v, r, f = state.position_w, state.velocity_w, state.rate_b, state.specific_force_b
         w, x, y, z = state.attitude_wb
         a, b, c = 0.5 * e[9], 0.5 * e[10], 0.5 * e[11]  # small turn in body axes
@@ -73,7 +87,7 @@ class Estimator:
         )
         norm = math.sqrt(sum(part * part for part in attitude))
         return Estimate(
-            (p[0] + e[0] + e[3], p[1] + e[1] + e[4], p[2] + e[2] + e[5]),
+            (p[0] + e[0] + e[3] + far[0], p[1] + e[1] + e[4] + far[1], p[2] + e[2] + e[5] + far[2]),
             (v[0] + e[6], v[1] + e[7], v[2] + e[8]),
             (attitude[0] / norm, attitude[1] / norm, attitude[2] / norm, attitude[3] / norm),
             (r[0] + e[12], r[1] + e[13], r[2] + e[14]),

@@ -10,6 +10,8 @@ Vec3 = tuple[float, float, float]
 WITH, WITHOUT, CARRIED = "grasp", "grasp, not compensated", "carried"
 """Names of the marks of a grasp."""
 
+_ASKED_FOR_S = 0.2  # a set-point older than that is asked no more
+
 
 @dataclass(frozen=True, slots=True)
 class WrenchSeen:
@@ -62,6 +64,8 @@ class Flight:
     payloads: list[PayloadSeen] = field(default_factory=list)
     texts: list[tuple[float, str]] = field(default_factory=list)
     marks: list[Mark] = field(default_factory=list)
+    asked: list[tuple[float, Vec3]] = field(default_factory=list)
+    """Position that the daemon asked of the vehicle at each time that it did, m, world axes."""
     end: float = 0.0
 
     def spans(self) -> list[tuple[str, float, float]]:
@@ -79,3 +83,8 @@ class Flight:
         """The newest sample at time `t`."""
         i = bisect.bisect_right(self.samples, t, key=lambda s: s.t)
         return self.samples[i - 1] if i else None
+
+    def asked_at(self, t: float) -> Vec3 | None:
+        """Where the vehicle was asked to be at time `t`, m; None while nobody asked."""
+        i = bisect.bisect_right(self.asked, t, key=lambda pair: pair[0])
+        return self.asked[i - 1][1] if i and t - self.asked[i - 1][0] <= _ASKED_FOR_S else None

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from arm_companion.config.schema import Config
 from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight
-from arm_companion.sim.verdict import Verdict, after, unharmed, wrench_errors
+from arm_companion.sim.verdict import Verdict, after, excursion, unharmed, wrench_errors
 from arm_companion.sim.world import Sample
 
 PLACED_WITHIN_M = 0.05
@@ -84,6 +84,7 @@ def judge_grasp(flight: Flight, failure: str, config: Config) -> GraspVerdict:
         verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in carried)
     kinds = {"free": ("READY", "APPROACH", "DEPART"), "carried": ("LIFT", "CARRY", "PLACE")}
     verdict.wrench = wrench_errors(flight, kinds)
+    verdict.excursion_m = excursion(flight)
     verdict.pick_ups = _pick_ups(flight)
     verdict.mass_kg, verdict.placed_m = config.sim.object.mass_kg, placed
     weights = [seen for seen in flight.payloads if seen.valid]
@@ -131,7 +132,8 @@ def _pick_ups(flight: Flight) -> list[PickUp]:
         if mark.name not in (WITH, WITHOUT) or not inside:
             continue
         start, end = inside[0][0], inside[-1][1]
-        asked = [(s, s.asked_w) for s in flight.within(start, end + _SETTLED_S) if s.asked_w is not None]
+        during = flight.within(start, end + _SETTLED_S)
+        asked = [(s, place) for s in during if (place := flight.asked_at(s.t)) is not None]
         samples = [(s, place) for s, place in asked if asked[0][1][2] - place[2] > _ASKED_UP_M]
         if not samples:
             continue

@@ -4,7 +4,7 @@ import math
 import statistics
 
 from arm_companion.sim.flight import Flight
-from arm_companion.sim.verdict import Verdict, after, unharmed, wrench_errors
+from arm_companion.sim.verdict import Verdict, after, excursion, unharmed, wrench_errors
 from arm_companion.sim.world import Sample
 
 _CARRIED_SHARE = 0.6  # of the weight that the bar carries in a vehicle that hangs
@@ -39,6 +39,7 @@ def judge_hang(flight: Flight, failure: str, weight_n: float) -> Verdict:
         forces = [s.truth.contact_force_n for s in hung]
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))
         verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in hung)
+    verdict.excursion_m = excursion(flight)
     verdict.wrench = wrench_errors(flight, {"free": ("READY", "APPROACH", "DEPART"), "hanging": ("HANGING",)})
     return verdict
 

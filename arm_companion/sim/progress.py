@@ -60,15 +60,14 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
             f"{_mm(move.made_m)} made",
             f"asked {_mm(move.asked_m)}, error {_mm(move.error_m)}, arm's force {move.force_n:.1f} N",
         )
+    if not math.isnan(verdict.excursion_m):
+        table.add_row(
+            "excursion after release", _mm(verdict.excursion_m), "greatest distance from where it was asked to be"
+        )
     if isinstance(verdict, GraspVerdict):
         _show_grasp(verdict, table)
     if isinstance(verdict, AbortVerdict):
-        for abort in verdict.aborts:
-            table.add_row(
-                f"abort in {abort.state}",
-                f"{abort.let_go_s:.1f} s" if abort.let_go_s else "no touch",
-                f"until the bar was let go; vehicle {_mm(abort.sank_m)} lower at most",
-            )
+        _show_aborts(verdict, table)
     console.print(table)
     style = "bold green" if verdict.success else "bold red"
     console.print(
@@ -98,6 +97,16 @@ def _show_grasp(verdict: GraspVerdict, table: Table) -> None:
             f"error {verdict.mass_error:+.1%}",
         )
     table.add_row("object put down", _mm(verdict.placed_m), "from where it lay")
+
+
+def _show_aborts(verdict: AbortVerdict, table: Table) -> None:
+    """What a flight with aborts has besides."""
+    for abort in verdict.aborts:
+        table.add_row(
+            f"abort in {abort.state}",
+            f"{abort.let_go_s:.1f} s" if abort.let_go_s else "no touch",
+            f"until the bar was let go; vehicle {_mm(abort.sank_m)} lower at most",
+        )
 
 
 def show_outcome(outcome: Outcome, done: str, stream: TextIO) -> None:

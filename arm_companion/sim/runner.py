@@ -104,6 +104,7 @@ async def fly_simulated(
         failure = await fly(Operator(link, config, flight, say))
         stop.set()
         await asyncio.sleep(0.5)
+    flight.asked = [(r.t, r.commands.setpoint.position_w) for r in memory.records if r.commands.setpoint is not None]
     return Result(flight, failure, daemon.cycles, daemon.missed, poses=plant.poses, records=memory.records)
 
 

@@ -11,6 +11,7 @@ from arm_companion.config.schema import Config
 from arm_companion.protocol.dialect import mav
 from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight, Mark, PayloadSeen, TendonsSeen, Vec3, WrenchSeen
 from arm_companion.sim.operator_link import Address, OperatorLink
+from arm_companion.sim.sitl_px4 import HOME
 
 Say = Callable[[str], None]
 
@@ -131,7 +132,7 @@ class Operator:
     async def _take_off(self) -> None:
         self.say("arm made ready, vehicle takes off")
         await self.order(mav.MAV_CMD_ARM_READY, "READY", 20.0)
-        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=60.0)
+        await self._vehicle(mav.MAV_CMD_COMPONENT_ARM_DISARM, [1.0], "arming", retry_s=60.0, before=self._tell_origin)
         height = self.config.sim.takeoff_height_m
         if self._ardupilot:
             # it takes off by command in GUIDED only, PX4 in any mode but OFFBOARD; and it tells only what is asked
@@ -148,6 +149,13 @@ class Operator:
         await asyncio.sleep(2.0)
         if not self._ardupilot:
             await self._take_external_control()
+
+    def _tell_origin(self) -> None:
+        """Where on earth the origin is: without satellites nobody else tells, and PX4's HOLD asks for it."""
+        if self.config.sim.sitl_position == "capture":
+            latitude, longitude, height = (round(v * scale) for v, scale in zip(HOME, (1e7, 1e7, 1e3), strict=True))
+            origin = mav.MAVLink_set_gps_global_origin_message(self._autopilot[0], latitude, longitude, height)
+            self._link.send(origin, self._autopilot)
 
     async def _take_external_control(self) -> None:
         self.say("external set-points on")
@@ -281,12 +289,20 @@ class Operator:
     async def _compensate(self, *, on: bool) -> None:
         await self.order(mav.MAV_CMD_ARM_FEEDFORWARD, "FEEDFORWARD", 5.0, float(on))
 
-    async def _vehicle(self, command: int, parameters: list[float], what: str, retry_s: float = 0.0) -> None:
-        """A command to the autopilot, repeated for `retry_s` while it is not ready yet."""
+    async def _vehicle(
+        self,
+        command: int,
+        parameters: list[float],
+        what: str,
+        retry_s: float = 0.0,
+        before: Callable[[], None] = lambda: None,
+    ) -> None:
+        """A command to the autopilot, repeated for `retry_s` while it is not ready yet; `before` is done each time."""
         loop = asyncio.get_running_loop()
         until = loop.time() + retry_s
         padded = [*parameters, *[0.0] * (7 - len(parameters))]
         while True:
+            before()
             result = await self._link.command(command, padded, target=self._autopilot, timeout=5.0)
             if result == mav.MAV_RESULT_ACCEPTED:
                 return

@@ -9,15 +9,14 @@ the ground listen there themselves. In simulated time a relay does, which reads 
 import contextlib
 import os
 import select
+import shutil
 import signal
-import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from types import FrameType
@@ -25,10 +24,12 @@ from typing import Protocol
 
 from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
-from arm_companion.errors import ArmError, ConfigError, LinkError
+from arm_companion.errors import ArmError, ConfigError
 from arm_companion.sim import sitl_ardupilot, sitl_px4
-from arm_companion.sim.ports import RigidState, RotorCommand, Vec3
-from arm_companion.transport.base import Opener, Transport
+from arm_companion.sim.capture import Capture, CaptureLine
+from arm_companion.sim.ports import RigidState, RotorCommand
+from arm_companion.sim.sitl_relay import Relay
+from arm_companion.transport.base import Opener
 
 STACKS = ("ardupilot", "px4")
 BINARY_VARIABLES = {"ardupilot": "ARM_COMPANION_ARDUPILOT_SITL", "px4": "ARM_COMPANION_PX4_SITL"}
@@ -102,20 +103,34 @@ def binary(stack: str, given: Path | None) -> Path:
     return path
 
 
-def parameters(stack: str) -> Path:
-    """The shipped parameter file of a flight stack.
+def parameters(stack: str, position: str = "satellites") -> list[Path]:
+    """The shipped parameter files of a flight stack; what a later one says counts.
+
+    Args:
+        stack: one of STACKS.
+        position: where it knows its position from, as `sim.sitl_position`.
 
     Raises:
         ConfigError: the package is incomplete.
     """
     places = (Path(str(resources.files("arm_companion"))) / "configs", Path(__file__).resolve().parents[2] / "configs")
+    names = [f"{stack}.parm", f"{stack}_capture.parm"] if position == "capture" else [f"{stack}.parm"]
     for place in places:
-        if (path := place / "sitl" / f"{stack}.parm").is_file():
-            return path
+        if all((place / "sitl" / name).is_file() for name in names):
+            return [place / "sitl" / name for name in names]
     raise ConfigError(f"the parameters for {stack} are missing from this installation")
 
 
-def launch(stack: str, program: Path, config: Config, physics_port: int, *, simulated: bool) -> Launch:
+def launch(
+    stack: str,
+    program: Path,
+    config: Config,
+    physics_port: int,
+    *,
+    simulated: bool,
+    capture_port: int | None = None,
+    more: Sequence[Path] = (),
+) -> Launch:
     """The command line of a flight stack.
 
     Args:
@@ -124,27 +139,32 @@ def launch(stack: str, program: Path, config: Config, physics_port: int, *, simu
         config: its links say where MAVLink goes.
         physics_port: of the bridge.
         simulated: as fast as it goes.
+        capture_port: where ArduPilot hears motion capture.
+        more: parameter files besides.
 
     Raises:
         ConfigError: PX4 without its `etc` beside it, or ports that PX4 cannot have.
     """
     companion, ground = _ports(config)
+    files = [*parameters(stack, config.sim.sitl_position), *more]
     if stack == "ardupilot":
         latitude, longitude, height = sitl_px4.HOME
         words = [
             str(program),
             *("--model", f"JSON:{_LOOPBACK}", "--sim-port-out", str(physics_port)),
             *("--speedup", str(_FASTEST if simulated else 1), "--home", f"{latitude},{longitude},{height},0"),
-            *("--defaults", str(parameters(stack)), "--wipe"),
+            *("--defaults", ",".join(map(str, files)), "--wipe"),
             *("--serial0", f"udpclient:{_LOOPBACK}:{ground}", "--serial1", f"udpclient:{_LOOPBACK}:{companion}"),
         ]
+        if capture_port is not None:
+            words += ["--serial2", f"udpclient:{_LOOPBACK}:{capture_port}"]
         return Launch(tuple(words), {})
     if (physics_port, companion, ground) != (sitl_px4.PORT, 14540, 14550):
         raise ConfigError("PX4 SITL has its own ports: 14540 to the companion, 14550 to the ground")
     etc = program.parent.parent / "etc"
     if not etc.is_dir():
         raise ConfigError(f"PX4 SITL needs its build's etc directory: {etc} is missing")
-    lines = (line.split() for line in parameters(stack).read_text(encoding="utf-8").splitlines())
+    lines = (line.split() for file in files for line in file.read_text(encoding="utf-8").splitlines())
     values = {f"PX4_PARAM_{words[0]}": words[1] for words in lines if len(words) == 2}
     values["PX4_PARAM_MIS_TAKEOFF_ALT"] = str(config.sim.takeoff_height_m)
     return Launch((str(program), "-d", "-i", "0", str(etc)), {"PX4_SIM_MODEL": "none_iris", **values})
@@ -155,58 +175,6 @@ def _ports(config: Config) -> tuple[int, int]:
     urls = (config.sim.autopilot_url, config.sim.operator_autopilot_url)
     companion, ground = (int(url.rpartition(":")[2]) for url in urls)
     return companion, ground
-
-
-class Relay:
-    """The flight stack's MAVLink ports in simulated time: UDP on one side, pipes of the simulated loop on the other.
-
-    Args:
-        ports: that the flight stack sends to; one for each pipe.
-
-    Raises:
-        LinkError: a port is taken.
-    """
-
-    def __init__(self, ports: Sequence[int]) -> None:
-        self._sockets: list[socket.socket] = []
-        self._peers: list[tuple[str, int] | None] = [None] * len(ports)
-        self._ends: list[Transport | None] = [None] * len(ports)
-        for port in ports:
-            plain = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._sockets.append(plain)
-            plain.setblocking(False)
-            try:
-                plain.bind((_LOOPBACK, port))
-            except OSError as error:
-                self.close()
-                raise LinkError(f"UDP port {port} for the flight stack's MAVLink: {error.strerror}") from error
-
-    def close(self) -> None:
-        """Leave the ports."""
-        for plain in self._sockets:
-            plain.close()
-
-    async def connect(self, openers: Sequence[Opener]) -> None:
-        """Open the pipes."""
-        for i, opener in enumerate(openers):
-            self._ends[i] = await opener(partial(self._out, i))
-
-    def poll(self) -> None:
-        """Take in what the flight stack has sent."""
-        for i, (plain, end) in enumerate(zip(self._sockets, self._ends, strict=True)):
-            while True:
-                try:
-                    data, self._peers[i] = plain.recvfrom(65_536)
-                except OSError:  # nothing more
-                    break
-                if end is not None:
-                    end.write(data)
-
-    def _out(self, i: int, data: bytes) -> None:
-        peer = self._peers[i]
-        if peer is not None:
-            with contextlib.suppress(OSError):  # a flight stack that boots is not there for a while
-                self._sockets[i].sendto(data, peer)
 
 
 class Sitl:
@@ -222,7 +190,6 @@ class Sitl:
         self.bridge = bridge
         self.log = log
         self.silent = False
-        self.asked_w: Vec3 | None = None  # it tells nobody but its own log
         self.period_s = bridge.period_s
         self._process = process
         self._relay = relay
@@ -282,7 +249,9 @@ class Sitl:
 
 
 @contextlib.contextmanager
-def running(stack: str, program: Path, config: Config, log: Path, *, simulated: bool) -> Iterator[Sitl]:
+def running(
+    stack: str, program: Path, config: Config, log: Path, *, simulated: bool, scripts: Sequence[Path] = ()
+) -> Iterator[Sitl]:
     """A flight stack for the time of a block. However the block ends, the program and its children end with it.
 
     Args:
@@ -291,6 +260,7 @@ def running(stack: str, program: Path, config: Config, log: Path, *, simulated: 
         config: of the world.
         log: takes what the program writes.
         simulated: time.
+        scripts: in Lua, that ArduPilot runs.
 
     Raises:
         ConfigError: it cannot be started like this.
@@ -299,24 +269,61 @@ def running(stack: str, program: Path, config: Config, log: Path, *, simulated: 
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.ExitStack() as undo:
-        bridge = _bridge(stack, config)
+        line = _capture_line(stack, config)
+        if line is not None:
+            undo.callback(line.close)
+        bridge = _bridge(stack, config, line)
         undo.callback(bridge.close)
         if config.sim.step_s > bridge.period_s:
             raise ConfigError(f"sim.step_s = {config.sim.step_s:g} is longer than the {bridge.period_s:g} s of {stack}")
         relay = Relay(_ports(config)) if simulated else None
         if relay is not None:
             undo.callback(relay.close)
-        how = launch(stack, program, config, bridge.address[1], simulated=simulated)
-        directory = undo.enter_context(tempfile.TemporaryDirectory(prefix="arm-companion-sitl-"))
+        directory = Path(undo.enter_context(tempfile.TemporaryDirectory(prefix="arm-companion-sitl-")))
+        how = launch(
+            stack,
+            program,
+            config,
+            bridge.address[1],
+            simulated=simulated,
+            capture_port=None if line is None else line.port,
+            more=_with_scripts(directory, scripts),
+        )
         undo.enter_context(_ending_on_terminate())
-        process = undo.enter_context(_started(how, Path(directory), log))
+        process = undo.enter_context(_started(how, directory, log))
         yield Sitl(bridge, process, log, relay)
 
 
-def _bridge(stack: str, config: Config) -> sitl_ardupilot.ArdupilotBridge | sitl_px4.Px4Bridge:
+def _with_scripts(directory: Path, scripts: Sequence[Path]) -> list[Path]:
+    """Put Lua scripts where ArduPilot looks for them; the parameter files that let it."""
+    if not scripts:
+        return []
+    (directory / "scripts").mkdir()
+    for script in scripts:
+        shutil.copy(script, directory / "scripts")
+    enable = directory / "scripts.parm"
+    enable.write_text("SCR_ENABLE 1\n", encoding="ascii")
+    return [enable]
+
+
+def _capture(config: Config) -> Capture:
+    return Capture(config.sim.seed, config.sim.position_noise_m)
+
+
+def _capture_line(stack: str, config: Config) -> CaptureLine | None:
+    """ArduPilot's line to motion capture; PX4 hears it beside its sensors."""
+    if stack != "ardupilot" or config.sim.sitl_position != "capture":
+        return None
+    return CaptureLine(_capture(config))
+
+
+def _bridge(
+    stack: str, config: Config, line: CaptureLine | None
+) -> sitl_ardupilot.ArdupilotBridge | sitl_px4.Px4Bridge:
     if stack == "ardupilot":
-        return sitl_ardupilot.ArdupilotBridge(config.vehicle.mass_kg)
-    return sitl_px4.Px4Bridge(config.vehicle.mass_kg, config.sim.seed)
+        return sitl_ardupilot.ArdupilotBridge(config.vehicle.mass_kg, capture=line)
+    capture = _capture(config) if config.sim.sitl_position == "capture" else None
+    return sitl_px4.Px4Bridge(config.vehicle.mass_kg, config.sim.seed, capture=capture)
 
 
 @contextlib.contextmanager

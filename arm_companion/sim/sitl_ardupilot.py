@@ -13,6 +13,7 @@ import time
 from collections.abc import Sequence
 
 from arm_companion.errors import LinkError
+from arm_companion.sim.capture import CaptureLine
 from arm_companion.sim.ports import RigidState, RotorCommand
 from arm_companion.sim.rotors import LAYOUT, Rotors
 
@@ -76,6 +77,7 @@ class ArdupilotBridge:
     Args:
         mass: of the whole vehicle, kg.
         address: where SITL sends its packets.
+        capture: tells it where it is; None: satellites alone do.
 
     Attributes:
         frames, repeated, malformed, boots: counted.
@@ -87,9 +89,12 @@ class ArdupilotBridge:
     period_s = 0.002
     """Of the turns: 500 Hz, which ArduPilot's own loop of 400 Hz follows."""
 
-    def __init__(self, mass: float, address: tuple[str, int] = ("127.0.0.1", PORT)) -> None:
+    def __init__(
+        self, mass: float, address: tuple[str, int] = ("127.0.0.1", PORT), capture: CaptureLine | None = None
+    ) -> None:
         self.frames = self.repeated = self.malformed = self.boots = 0
         self._rotors = Rotors(mass)
+        self._capture = capture
         self._throttles: Sequence[float] = (0.0,) * len(LAYOUT)
         self._peer: tuple[str, int] | None = None
         self._sender: tuple[str, int] | None = None  # of the packet that was read last
@@ -145,6 +150,8 @@ class ArdupilotBridge:
             dt: s since the last call.
         """
         self._t += dt
+        if self._capture is not None:
+            self._capture.tell(state, self._t, dt)  # before the answer, which gives SITL its turn
         self._answer = state_line(self._t, state)
         self._send(self._answer)
         self._waiting = self._peer is not None

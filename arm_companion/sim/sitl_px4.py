@@ -15,6 +15,8 @@ from typing import Any
 
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.capture import Capture
+from arm_companion.sim.mjcf import GRAVITY
 from arm_companion.sim.ports import RigidState, RotorCommand, Vec3
 from arm_companion.sim.rotors import LAYOUT, Rotors
 
@@ -39,6 +41,7 @@ class Px4Bridge:
         mass: of the whole vehicle, kg.
         seed: of the sensors' noise.
         address: where PX4 connects.
+        capture: tells it where it is; None: satellites and barometer alone do.
 
     Attributes:
         frames: HIL_ACTUATOR_CONTROLS taken.
@@ -52,13 +55,17 @@ class Px4Bridge:
     period_s = 0.004
     """Of the turns: PX4 expects the sensors at 250 Hz."""
 
-    def __init__(self, mass: float, seed: int, address: tuple[str, int] = ("127.0.0.1", PORT)) -> None:
+    def __init__(
+        self, mass: float, seed: int, address: tuple[str, int] = ("127.0.0.1", PORT), capture: Capture | None = None
+    ) -> None:
         self.frames = self.malformed = self.boots = 0
         self._rotors = Rotors(mass)
         self._throttles: Sequence[float] = (0.0,) * len(LAYOUT)
         self._rng = random.Random(seed)  # noqa: S311 - a simulation, repeatable by design
+        self._capture = capture
         self._t = _START_S
         self._turns = 0
+        self._velocity: Vec3 | None = None  # at the last turn
         self._waiting = False
         self._lockstep = False  # it has answered, and so will answer every turn
         self._codec = self._fresh_codec()
@@ -117,7 +124,9 @@ class Px4Bridge:
         """
         self._t += dt
         self._turns += 1
-        for message in self._messages(state):
+        if self._capture is not None and (pose := self._capture.message(state, self._t, dt)) is not None:
+            self._send(pose)  # before the sensors, which it belongs to: they give PX4 its turn
+        for message in self._messages(state, self._felt(state, dt)):
             self._send(message)
         self._waiting = self._connection is not None
         return self._rotors.turn(self._throttles, dt)
@@ -129,7 +138,18 @@ class Px4Bridge:
 
     # Sensors --------------------
 
-    def _messages(self, state: RigidState) -> list[Any]:
+    def _felt(self, state: RigidState, dt: float) -> Vec3:
+        """Specific force, m/s^2, body axes, mean since the last turn: sensors integrate, and so does what reads them.
+
+        The force of one instant would be off by what a bar's blow did between two instants.
+        """
+        before, self._velocity = self._velocity, state.velocity_w
+        if before is None or dt <= 0.0:
+            return state.specific_force_b
+        a, b, c = ((new - old) / dt for new, old in zip(state.velocity_w, before, strict=True))
+        return to_body(state.attitude_wb, (a, b, c - GRAVITY))
+
+    def _messages(self, state: RigidState, felt: Vec3) -> list[Any]:
         turns, time_usec = self._turns, round(self._t * 1e6)
         updated = _IMU
         updated |= _MAG if turns % _MAG_EVERY == 0 else 0
@@ -140,7 +160,7 @@ class Px4Bridge:
         messages = [
             mav.MAVLink_hil_sensor_message(
                 time_usec,
-                *self._noisy(state.specific_force_b, _ACCEL_NOISE),
+                *self._noisy(felt, _ACCEL_NOISE),
                 *self._noisy(state.rate_b, _GYRO_NOISE),
                 *self._noisy(to_body(state.attitude_wb, _FIELD_NED), _MAG_NOISE),
                 pressure / 100.0,

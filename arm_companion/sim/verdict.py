@@ -52,6 +52,7 @@ class Verdict:
     wrench: list[WrenchError] = field(default_factory=list)
     moves: list[Move] = field(default_factory=list)
     hover_error_m: float = math.nan  # RMS about the mean while perched and not moved
+    excursion_m: float = math.nan  # greatest distance from where it was asked to be while the arm lets go
 
 
 def judge(flight: Flight, failure: str) -> Verdict:
@@ -78,6 +79,7 @@ def judge(flight: Flight, failure: str) -> Verdict:
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))
         verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in perched)
     verdict.wrench = wrench_errors(flight, {"free": ("READY", "APPROACH", "DEPART"), "perched": ("PERCHED",)})
+    verdict.excursion_m = excursion(flight)
     still = next((mark for mark in flight.marks if mark.name == "hold"), None)
     if still is not None:
         verdict.hover_error_m = _spread(flight.within(still.start, still.end))
@@ -107,6 +109,19 @@ def after(flight: Flight, *, perched: bool) -> list[str]:
     ):
         reasons.append("the vehicle did not land")
     return reasons
+
+
+def excursion(flight: Flight) -> float:
+    """Greatest distance of the vehicle from where it was asked to be while the arm lets go for the last time, m.
+
+    All of RELEASE, of which the arm holds the bar for the first third and uncurls in the air for the rest; what the
+    departure adds is how the autopilot accelerates. nan without one.
+    """
+    spans = [(start, end) for name, start, end in flight.spans() if name == "RELEASE"]
+    if not spans:
+        return math.nan
+    asked = [(s, place) for s in flight.within(*spans[-1]) if (place := flight.asked_at(s.t)) is not None]
+    return max((math.dist(s.state.position_w, place) for s, place in asked), default=math.nan)
 
 
 def unharmed(flight: Flight) -> list[str]:

@@ -16,7 +16,7 @@ from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
 from arm_companion.sim.autopilot import AutopilotStandIn
 from arm_companion.sim.plant import Plant, Pose
-from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
+from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
 from arm_companion.sim.servo_emulator import ServoEmulator
 from arm_companion.sim.wind import Wind
 from arm_companion.transport.base import Opener
@@ -34,7 +34,6 @@ class Sample:
     t: float
     state: RigidState
     truth: PlantTruth
-    asked_w: Vec3 | None = None  # position that the autopilot flies to; None: none, or not in all axes
 
 
 class FlightStack(Protocol):
@@ -45,10 +44,6 @@ class FlightStack(Protocol):
     """
 
     period_s: float
-
-    @property
-    def asked_w(self) -> Vec3 | None:
-        """Position that it flies to, m, world axes; None: none, not in all axes, or not known."""
 
     def due(self) -> bool:
         """Whether the world may go on; False while a flight stack in lock-step has not had its turn."""
@@ -119,8 +114,7 @@ class World:
                 self._advance()
                 periods += 1
                 if periods % sampled == 0:
-                    asked = self.flown_by.asked_w
-                    self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth(), asked))
+                    self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth()))
 
     def _advance(self) -> None:
         """One control period."""

@@ -235,6 +235,18 @@ def test_estimator_errors_have_the_configured_size_and_wander_slowly() -> None:
     assert np.abs(np.diff(track, axis=0)).max() < 2 * sigma  # no jumps from one sample to the next
 
 
+def test_an_estimate_on_satellites_wanders_by_centimetres_within_seconds_and_its_velocity_says_nothing_of_it() -> None:
+    """As measured on both real flight stacks (docs/adr/0029)."""
+    still = RigidBody().state()
+    estimator = Estimator(random.Random(1), 0.004, 0.02)
+    estimates = [estimator.update(still, 0.01) for _ in range(60_000)]
+    track = np.array([estimate.position_w for estimate in estimates])
+    assert np.std(track) == pytest.approx(0.02, rel=0.25)
+    moved = np.abs(track[300:] - track[:-300])
+    assert 0.008 < np.median(moved) < 0.03, "within three seconds"
+    assert np.std([estimate.velocity_w for estimate in estimates]) < 0.015
+
+
 def test_without_noise_the_estimate_is_the_truth() -> None:
     state = RigidBody(position=np.array([1.0, 2.0, -3.0])).state()
     estimate = Estimator(random.Random(0), 0.0).update(state, DT)

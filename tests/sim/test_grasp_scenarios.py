@@ -81,7 +81,7 @@ def test_a_load_that_slips_out_is_told_within_three_tenths_of_a_second() -> None
     assert any("load lost" in text for _, text in result.flight.texts)
     assert any(record.commands.status.error_bits & ArmFault.CONTACT_LOST for record in held)
     after = result.flight.within(lost[0], lost[0] + 3.0)
-    asked = [(s, s.asked_w) for s in after if s.asked_w is not None]
+    asked = [(s, place) for s in after if (place := result.flight.asked_at(s.t)) is not None]
     assert max(abs(s.state.position_w[2] - place[2]) for s, place in asked) < 0.15
     assert "did not land" not in verdict.reason
 

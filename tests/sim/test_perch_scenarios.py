@@ -18,6 +18,7 @@ from arm_companion.record.reader import Item, Reader
 from arm_companion.record.replay import replay
 from arm_companion.record.topics import COMMANDS, FACTS, LOG, RAW, STATE, TRANSITIONS
 from arm_companion.record_codec import dumps, loads
+from arm_companion.sim.asked import asked
 from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.verdict import Verdict, judge
 from arm_companion.sim.world import World
@@ -115,6 +116,18 @@ def test_compensation_makes_the_move_that_the_vehicle_alone_does_not() -> None:
     pull = {move.name: move for move in verdict.moves}
     assert pull["pull x"].error_m < 0.3 * pull["pull x, not compensated"].error_m
     assert pull["pull x, not compensated"].made_m < 0.005
+
+
+def test_a_vehicle_that_is_let_go_stays_where_it_is_asked_to_be() -> None:
+    _, verdict = perch()
+    assert 0.001 < verdict.excursion_m < 0.15
+
+
+def test_where_the_vehicle_was_asked_to_be_can_be_read_from_the_record() -> None:
+    """As in real time, where the daemon is another process."""
+    result, _ = perch()
+    assert asked(log()) == result.flight.asked
+    assert asked(log().with_name("nothing.mcap")) == []
 
 
 def test_the_predicted_wrench_is_the_plants() -> None:

@@ -7,7 +7,7 @@ import asyncio
 import contextlib
 import itertools
 import math
-from collections.abc import AsyncIterator, Callable, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -107,15 +107,22 @@ class Rig:
         return -self.world.plant.state().position_w[2]
 
 
-def fly(stack: str, log: Path, test: Callable[[Rig], Coroutine[Any, Any, T]], *, daemon: bool = True) -> T:
-    """Run a test against a freshly started flight stack."""
-    config = load("sim.toml", [f'vehicle.autopilot="{stack}"'])
+def fly(
+    stack: str,
+    log: Path,
+    test: Callable[[Rig], Coroutine[Any, Any, T]],
+    *,
+    daemon: bool = True,
+    scripts: Sequence[Path] = (),
+) -> T:
+    """Run a test against a freshly started flight stack, which knows its position from satellites."""
+    config = load("sim.toml", [f'vehicle.autopilot="{stack}"', 'sim.sitl_position="satellites"'])
 
     async def main(running: sitl.Sitl) -> T:
         async with _rig(running, stack, config, daemon=daemon) as rig:
             return await test(rig)
 
-    with sitl.running(stack, sitl.binary(stack, None), config, log, simulated=True) as running:
+    with sitl.running(stack, sitl.binary(stack, None), config, log, simulated=True, scripts=scripts) as running:
         return run_simulated(main(running))
 
 

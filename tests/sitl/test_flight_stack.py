@@ -12,16 +12,26 @@ import pytest
 from arm_companion.clock import run_simulated, ticks
 from arm_companion.config import load
 from arm_companion.drivers.path_feedforward import PathFeedforward
-from arm_companion.mission.facts import Setpoint, Vec3
+from arm_companion.mission.facts import Control, Setpoint, Vec3
+from arm_companion.mission.state import MOVES_VEHICLE
 from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.tunnel import tunnel
 from arm_companion.sim import sitl
+from arm_companion.sim.flight import WITH, WITHOUT
 from arm_companion.sim.flight_control import ZERO
-from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.grasp_verdict import GraspVerdict
+from arm_companion.sim.judges import SCENARIOS
+from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.sitl_check import Check, Findings
-from arm_companion.sim.verdict import judge
+from arm_companion.sim.sitl_px4 import HOME
+from arm_companion.sim.verdict import Verdict
 from tests.sitl.rig import ARM, AUTOPILOT, GUIDED, Rig, fly, gaps_p99
 
 pytestmark = pytest.mark.sitl
+
+NAV_SCRIPT_TIME = 42702  # ArduPilot's own
+ARDUPILOT_SCRIPT = Path(__file__).parents[2] / "configs" / "ardupilot" / "arm_companion.lua"
 
 
 def test_it_connects_tells_its_state_and_flies_set_points(stack: str, tmp_path: Path) -> None:
@@ -49,12 +59,36 @@ def test_it_connects_tells_its_state_and_flies_set_points(stack: str, tmp_path: 
         assert (mode >> 16) & 0xFF != 6, "it leaves OFFBOARD by COM_OBL_RC_ACT"
 
 
-def test_a_perch_from_take_off_to_landing(stack: str, tmp_path: Path) -> None:
-    config = load("sim.toml", [f'vehicle.autopilot="{stack}"'])
-    with sitl.running(stack, sitl.binary(stack, None), config, tmp_path / "log", simulated=True) as running:
-        result = run_simulated(fly_simulated(config, print, log=tmp_path / "record.mcap", flown_by=running))
-    verdict = judge(result.flight, result.failure)
+def scenario(name: str, file: str, stack: str, directory: Path) -> tuple[Result, Verdict]:
+    """A whole flight, and the verdict on it."""
+    config, script = load(file, [f'vehicle.autopilot="{stack}"']), SCENARIOS[name]
+    log = directory / "record.mcap"
+    with sitl.running(stack, sitl.binary(stack, None), config, directory / "log", simulated=True) as running:
+        result = run_simulated(fly_simulated(config, print, log=log, fly=script.fly, flown_by=running))
+    return result, script.judge(result.flight, result.failure, config)
+
+
+def test_a_perch_from_take_off_to_landing_with_and_without_compensation(stack: str, tmp_path: Path) -> None:
+    result, verdict = scenario("perch", "sim.toml", stack, tmp_path)
+    error = {move.name: move.error_m for move in verdict.moves}
+    print(json.dumps({"stack": stack, **error, "excursion_m": verdict.excursion_m}))
     assert verdict.success, verdict.reason
+    assert error["pull x"] <= 0.5 * error["pull x, not compensated"]
+    assert verdict.excursion_m < 0.3
+    held = [(start, end) for name, start, end in result.flight.spans() if name not in ("STARTUP", "STOWED", "READYING")]
+    flown = [r for r in result.records if held[0][0] <= r.t <= held[-1][1] and r.state.phase in MOVES_VEHICLE]
+    assert all(r.facts.vehicle.control is Control.EXTERNAL for r in flown), "external control is lost"
+    assert gaps_p99([r.t for r in flown if r.commands.setpoint is not None]) < 0.03
+
+
+def test_an_object_is_picked_up_weighed_carried_and_put_back(stack: str, tmp_path: Path) -> None:
+    _, verdict = scenario("grasp", "sim_grasp.toml", stack, tmp_path)
+    assert isinstance(verdict, GraspVerdict)
+    error = {pick_up.name: pick_up.error_m for pick_up in verdict.pick_ups}
+    print(json.dumps({"stack": stack, **error, "weighed_kg": verdict.weighed_kg, "placed_m": verdict.placed_m}))
+    assert verdict.success, verdict.reason
+    assert error[WITH] <= 0.5 * error[WITHOUT]
+    assert abs(verdict.mass_error) < 0.1
 
 
 def test_a_force_on_the_vehicle_is_held_against(stack: str, tmp_path: Path) -> None:
@@ -155,11 +189,14 @@ async def land(rig: Rig) -> None:
 
 def test_traffic_to_the_ground_passes_the_autopilot_all_three_ways(stack: str, tmp_path: Path) -> None:
     heard: dict[str, int] = {}
+    values: dict[str, float] = {}
 
     async def look(rig: Rig) -> None:
         def count(message: Any) -> None:
             if (message.get_srcSystem(), message.get_srcComponent()) == ARM:
                 heard[message.get_type()] = heard.get(message.get_type(), 0) + 1
+                if message.get_type() == "PARAM_VALUE":
+                    values[message.param_id] = message.param_value
 
         rig.ground.watch(count)
         await rig.until(lambda: rig.ground.latest("HEARTBEAT", ARM) is not None, 60.0, "the arm is not heard")
@@ -169,6 +206,14 @@ def test_traffic_to_the_ground_passes_the_autopilot_all_three_ways(stack: str, t
         # parameters, there and back
         rig.ground.send(mav.MAVLink_param_request_list_message(*ARM), ARM)
         await rig.until(lambda: heard.get("PARAM_VALUE", 0) > 5, 10.0, "no parameters")
+        number = mav.MAV_PARAM_TYPE_REAL32
+        rig.ground.send(mav.MAVLink_param_set_message(*ARM, b"RATE_MIRRORS", 2.5, number), ARM)
+        await rig.until(lambda: values.get("RATE_MIRRORS") == 2.5, 10.0, "a parameter cannot be set")
+        # a target, as a frame of the dialect inside TUNNEL, to the arm
+        axis, nan = (0.0, 1.0, 0.0), math.nan
+        bar = mav.MAVLink_arm_target_message(*ARM, 0, 0, 1, (4.0, 1.0, -2.5), axis, [nan] * 4, 0.04, [nan] * 6, nan)
+        rig.ground.send(tunnel(MavlinkCodec(255, 190).encode(bar), *ARM), ARM)
+        await rig.until(lambda: (4.0, 1.0, -2.5) in targets(rig), 5.0, "no target arrives inside TUNNEL")
         # and the autopilot's own are its own
         rig.ground.send(
             mav.MAVLink_param_request_read_message(*AUTOPILOT, b"MAV_SYS_ID" if stack == "px4" else b"FRAME_CLASS", -1)
@@ -187,6 +232,82 @@ def test_traffic_to_the_ground_passes_the_autopilot_all_three_ways(stack: str, t
     assert heard["TUNNEL"] > 20, "the dialect, inside TUNNEL"
     assert heard["NAMED_VALUE_FLOAT"] > 20, "the mirrors"
     assert not any(name.startswith("ARM_") for name in heard), "private ids pass no stock autopilot"
+
+
+def targets(rig: Rig) -> set[Vec3]:
+    """Where the daemon has been told that the bar is."""
+    return {record.facts.bar.point_w for record in rig.recorder.records[-500:] if record.facts.bar is not None}
+
+
+def test_an_item_of_the_autopilots_mission_commands_the_arm(stack: str, tmp_path: Path) -> None:
+    """PX4 passes its gripper's item on; ArduPilot's script orders READY and holds the mission until that is done."""
+
+    async def look(rig: Rig) -> None:
+        await rig.until(lambda: rig.ground.latest("HEARTBEAT", ARM) is not None, 60.0, "the arm is not heard")
+        await rig.until(lambda: _phase(rig) == "STOWED", 30.0, "the arm does not find itself stowed")
+        item = (mav.MAV_CMD_DO_GRIPPER, float(ARM[1]), 1.0)
+        if stack == "ardupilot":
+            item = (NAV_SCRIPT_TIME, 1.0, 20.0)
+        await rig.arm_when_ready()
+        await climb(rig)
+        await rig.until(lambda: rig.height() > 0.8 * rig.config.sim.takeoff_height_m, 40.0, "it does not climb")
+        await asyncio.sleep(4.0)
+        await upload(rig, (mav.MAV_CMD_NAV_WAYPOINT, 0.0, 0.0), item, (mav.MAV_CMD_NAV_LOITER_UNLIM, 0.0, 0.0))
+        auto = (3.0, 0.0) if stack == "ardupilot" else (4.0, 4.0)
+        assert await rig.order(mav.MAV_CMD_DO_SET_MODE, 1.0, *auto) == mav.MAV_RESULT_ACCEPTED
+        if stack == "ardupilot":
+            await rig.until(lambda: _phase(rig) == "READY", 30.0, "the script's order does not arrive")
+            await rig.until(lambda: _reached(rig) >= 2, 10.0, "the script does not end its item")
+        else:
+            await rig.until(lambda: any(ours(rig, mav.MAV_CMD_DO_GRIPPER)), 30.0, "the arm does not answer the item")
+            # it is stowed: an order to grab cannot be carried out, and the mission goes on
+            assert any("PERCH" in text.text for text in rig.ground.texts if text.source == ARM)
+        await land(rig)
+
+    scripts = [ARDUPILOT_SCRIPT] if stack == "ardupilot" else []
+    fly(stack, tmp_path / "log", look, scripts=scripts)
+
+
+def ours(rig: Rig, command: int) -> list[Any]:
+    """What the arm has answered to the autopilot's own commands."""
+    acks = [m for _, m in rig.companion.heard if m.get_type() == "COMMAND_ACK" and m.command == command]
+    return [m for m in acks if (m.get_srcSystem(), m.get_srcComponent()) == ARM]
+
+
+def _reached(rig: Rig) -> int:
+    current = rig.ground.latest("MISSION_CURRENT")
+    return -1 if current is None else int(current.seq)
+
+
+async def upload(rig: Rig, *items: tuple[int, float, float]) -> None:
+    """A mission over its own start; of each item the command and its first two parameters.
+
+    ArduPilot keeps the place of its home in item 0.
+    """
+    await rig.order(mav.MAV_CMD_SET_MESSAGE_INTERVAL, float(mav.MAVLINK_MSG_ID_MISSION_CURRENT), 200_000.0)
+    latitude, longitude, _ = HOME
+    whole = [(mav.MAV_CMD_NAV_WAYPOINT, 0.0, 0.0), *items] if rig.stack == "ardupilot" else list(items)
+    asked: list[int] = []
+    ended: list[int] = []
+
+    def see(message: Any) -> None:
+        if message.get_type() in ("MISSION_REQUEST", "MISSION_REQUEST_INT"):
+            asked.append(message.seq)
+            command, first, second = whole[message.seq]
+            where = (round(latitude * 1e7), round(longitude * 1e7), rig.config.sim.takeoff_height_m)
+            frame = mav.MAV_FRAME_GLOBAL_RELATIVE_ALT_INT
+            numbers = (first, second, 0.0, math.nan if command != NAV_SCRIPT_TIME else 0.0)
+            one = mav.MAVLink_mission_item_int_message(
+                *AUTOPILOT, message.seq, frame, command, 0, 1, *numbers, *where, mav.MAV_MISSION_TYPE_MISSION
+            )
+            rig.ground.send(one)
+        elif message.get_type() == "MISSION_ACK":
+            ended.append(message.type)
+
+    rig.ground.watch(see)
+    rig.ground.send(mav.MAVLink_mission_count_message(*AUTOPILOT, len(whole), mav.MAV_MISSION_TYPE_MISSION))
+    await rig.until(lambda: bool(ended), 10.0, f"the mission is not taken: {asked}")
+    assert ended[0] == mav.MAV_MISSION_ACCEPTED
 
 
 def test_external_control_stays_until_the_pilot_takes_it_or_the_autopilot_boots(stack: str, tmp_path: Path) -> None:

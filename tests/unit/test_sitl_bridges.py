@@ -3,9 +3,12 @@
 import itertools
 import json
 import math
+import select
 import socket
+import statistics
 import struct
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -14,6 +17,7 @@ from hypothesis import strategies as st
 
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
+from arm_companion.sim.capture import Capture, CaptureLine
 from arm_companion.sim.flight_control import Airframe, Estimate, FlightController, MotionSetpoint
 from arm_companion.sim.ports import RigidState
 from arm_companion.sim.rotors import ARM_M, LAG_S, LAYOUT, THRUST_TO_WEIGHT, TORQUE_PER_THRUST_M, Rotors
@@ -313,8 +317,10 @@ def test_px4_sensors_feel_the_vehicle(px4: tuple[Px4Bridge, FakePx4]) -> None:
     state = RigidState((3.0, 4.0, -10.0), (1.0, 0.0, -0.5), quarter, (0.1, 0.2, 0.3), (0.4, 0.5, -9.0))
     assert bridge.answered(WAIT_S)
     times, magnetic, pressures = [], [], []
-    for _ in range(100):
-        bridge.control(state, bridge.period_s)
+    for i in range(100):
+        t = i * bridge.period_s  # body x points east, and body y south
+        moving = replace(state, velocity_w=(1.0 - 0.5 * t, 0.4 * t, -0.5 + 0.81 * t))
+        bridge.control(moving, bridge.period_s)
         message = peer.hear("HIL_SENSOR")
         times.append(message.time_usec)
         assert (message.xacc, message.yacc, message.zacc) == pytest.approx((0.4, 0.5, -9.0), abs=0.15)
@@ -329,7 +335,7 @@ def test_px4_sensors_feel_the_vehicle(px4: tuple[Px4Bridge, FakePx4]) -> None:
     assert sum(m[0] for m in magnetic) / 25 == pytest.approx(0.00771, abs=1e-3), "the nose is in the east"
     assert sum(m[1] for m in magnetic) / 25 == pytest.approx(-0.21523, abs=1e-3), "north is on the left"
     assert sum(pressures) / 20 == pytest.approx(atmosphere(HOME[2] + 10.0)[0] / 100.0, abs=0.02)
-    assert (gps[-1].vn, gps[-1].ve, gps[-1].vd, gps[-1].fix_type) == (100, 0, -50, 3)
+    assert (gps[-1].vn, gps[-1].ve, gps[-1].vd, gps[-1].fix_type) == (80, 16, -18, 3)
     assert gps[-1].alt == round((HOME[2] + 10.0) * 1e3)
     assert (gps[-1].lat - round(HOME[0] * 1e7)) * 1e-7 * 111_194.9 == pytest.approx(3.0, abs=0.02)
 
@@ -458,3 +464,58 @@ def test_a_body_is_flown_through_px4s_interface(px4: tuple[Px4Bridge, FakePx4]) 
         peer.controls(tuple(stack.motors(estimate, bridge.period_s)))
         assert bridge.answered(WAIT_S)
     arrives(body, stack)
+
+
+# Motion capture --------------------
+
+
+def test_motion_capture_tells_where_the_vehicle_is_50_times_a_second_within_its_noise() -> None:
+    turned = (math.cos(0.4), 0.0, 0.0, math.sin(0.4))
+    state = RigidState((3.0, 4.0, -10.0), (0.0, 0.0, 0.0), turned, (0.0, 0.0, 0.0), (0.0, 0.0, -9.81))
+    capture = Capture(1, 0.004)
+    told = [m for i in range(5000) if (m := capture.message(state, 0.002 * i, 0.002)) is not None]
+    assert len(told) == 500
+    assert {b.usec - a.usec for a, b in itertools.pairwise(told)} == {20_000}
+    away = [math.dist((m.x, m.y, m.z), state.position_w) for m in told]
+    assert 0.001 < statistics.median(away) < 0.02
+    assert told[0].yaw == pytest.approx(0.8, abs=0.02)
+
+
+def test_px4_feels_a_blow_that_falls_between_two_turns(px4: tuple[Px4Bridge, FakePx4]) -> None:
+    """Its velocity has changed by 0.2 m/s: that is what its sensor has to add up to, whatever it feels now."""
+    bridge, peer = px4
+    assert bridge.answered(WAIT_S)
+    felt = []
+    for v in (0.0, 0.0, 0.2, 0.2):
+        bridge.control(replace(STILL, velocity_w=(v, 0.0, 0.0)), bridge.period_s)
+        felt.append(peer.hear("HIL_SENSOR").xacc)
+    assert sum(felt) * bridge.period_s == pytest.approx(0.2, abs=0.001)
+
+
+def test_px4_hears_motion_capture_beside_its_sensors() -> None:
+    bridge = Px4Bridge(MASS, 1, ("127.0.0.1", 0), Capture(1, 0.0))
+    peer = FakePx4(bridge.address[1])
+    try:
+        assert bridge.answered(WAIT_S)
+        for _ in range(5):
+            bridge.control(replace(STILL, position_w=(1.0, 2.0, -3.0)), bridge.period_s)
+        message = peer.hear("VISION_POSITION_ESTIMATE")
+        assert (message.x, message.y, message.z) == (1.0, 2.0, -3.0)
+    finally:
+        peer.close()
+        bridge.close()
+
+
+def test_ardupilot_hears_motion_capture_on_a_line_of_its_own_once_it_has_spoken_there() -> None:
+    line = CaptureLine(Capture(1, 0.0))
+    codec = mav.MAVLink(None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as serial:
+        serial.settimeout(WAIT_S)
+        line.tell(STILL, 1.0, 0.02)  # to nobody
+        serial.sendto(b"heartbeat", ("127.0.0.1", line.port))
+        select.select([], [], [], 0.05)
+        line.tell(replace(STILL, position_w=(1.0, 2.0, -3.0)), 1.02, 0.02)
+        (message,) = codec.parse_buffer(serial.recv(4096))
+    line.close()
+    assert message.usec == 1_020_000
+    assert (message.x, message.y, message.z) == (1.0, 2.0, -3.0)

@@ -23,7 +23,8 @@ from arm_companion.config import Config, load
 from arm_companion.errors import ConfigError, LinkError
 from arm_companion.sim import sitl, sitl_ardupilot
 from arm_companion.sim.ports import RigidState
-from arm_companion.sim.sitl import Relay, Sitl, SitlFailed
+from arm_companion.sim.sitl import Sitl, SitlFailed
+from arm_companion.sim.sitl_relay import Relay
 from arm_companion.sim.world import World
 from arm_companion.transport.memory import MemoryPipe
 
@@ -99,7 +100,9 @@ def config() -> Config:
 @pytest.fixture(autouse=True)
 def _own_physics_port(monkeypatch: pytest.MonkeyPatch) -> None:
     bridge = sitl_ardupilot.ArdupilotBridge
-    monkeypatch.setattr(sitl_ardupilot, "ArdupilotBridge", lambda mass: bridge(mass, ("127.0.0.1", 0)))
+    monkeypatch.setattr(
+        sitl_ardupilot, "ArdupilotBridge", lambda mass, **others: bridge(mass, ("127.0.0.1", 0), **others)
+    )
 
 
 @contextmanager
@@ -248,6 +251,21 @@ def test_px4_needs_its_etc_and_its_ports(tmp_path: Path, config: Config) -> None
     assert how.environment["PX4_SIM_MODEL"] == "none_iris"
     assert how.environment["PX4_PARAM_THR_MDL_FAC"] == "1.0"
     assert how.environment["PX4_PARAM_MIS_TAKEOFF_ALT"] == str(plain.sim.takeoff_height_m)
+    assert how.environment["PX4_PARAM_EKF2_HGT_REF"] == "3", "motion capture tells the height"
+
+
+def test_motion_capture_is_a_choice(tmp_path: Path, config: Config) -> None:
+    """Satellites alone: no parameters for it, and no line."""
+    how = sitl.launch("ardupilot", tmp_path, config, 9002, simulated=True, capture_port=1234)
+    assert [Path(name).name for name in how.command[how.command.index("--defaults") + 1].split(",")] == [
+        "ardupilot.parm",
+        "ardupilot_capture.parm",
+    ]
+    assert how.command[-2:] == ("--serial2", "udpclient:127.0.0.1:1234")
+    outdoors = replace(config, sim=replace(config.sim, sitl_position="satellites"))
+    how = sitl.launch("ardupilot", tmp_path, outdoors, 9002, simulated=True)
+    assert how.command[how.command.index("--defaults") + 1].endswith("ardupilot.parm")
+    assert "--serial2" not in how.command
 
 
 def test_a_step_longer_than_a_turn_is_refused(tmp_path: Path, config: Config) -> None:

@@ -1,0 +1,81 @@
+"""What is fed forward when the mechanics fail in the middle of a move."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from arm_companion.arm.model import ArmSolution
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
+from arm_companion.errors import NoSolution
+from arm_companion.mission.facts import Facts
+from arm_companion.mission.motion import norm
+from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.state import Phase, State
+from arm_companion.mission.wrench import grip
+from tests.unit.mission_rig import BENT, PLACE, T0, memory, run
+
+Hovering = Callable[..., Facts]
+
+
+class Moody(RodModel):
+    """Mechanics that can be told to find no solution of a held arm."""
+
+    blind = False
+    starts: list[ArmSolution | None]
+
+    def held(self, *arguments: Any, start: ArmSolution | None = None, **others: Any) -> ArmSolution:
+        self.starts.append(start)
+        if self.blind:
+            raise NoSolution(1.0, "told so")
+        return super().held(*arguments, start=start, **others)
+
+
+def moving(parameters: Parameters, facts: Facts) -> State:
+    """A perched vehicle that has been asked to go 10 mm ahead."""
+    state = memory(Phase.PERCHED)
+    anchor = grip(Situation(state, facts, T0, parameters))
+    assert anchor.beyond
+    return dataclasses.replace(state, anchor=anchor, rest=PLACE, offset=(0.01, 0.0, 0.0))
+
+
+@pytest.fixture
+def moody(parameters: Parameters) -> Parameters:
+    model = Moody(ArmParameters.of(parameters.config.arm))
+    model.starts = []
+    return Parameters(parameters.config, model)
+
+
+def test_a_move_under_way_goes_on_with_the_last_stiffness_and_the_wrench_is_not_told(
+    moody: Parameters, hovering: Hovering
+) -> None:
+    model = moody.model
+    assert isinstance(model, Moody)
+    facts = hovering(BENT)
+    state, _ = run(moving(moody, facts), facts, moody, 2.0)
+    fed = norm(state.lean)
+    assert fed > 0.05
+    model.blind, model.starts = True, []
+    state, said = run(state, facts, moody, 2.0)
+    assert norm(state.lean) == pytest.approx(fed, rel=1e-6)
+    assert not said[-1].wrench.valid
+    assert math.isnan(said[-1].wrench.force_b[0])
+    assert len(model.starts) == pytest.approx(8, abs=2), "a search in vain takes long: it is not made in every cycle"
+    assert all(start is not None for start in model.starts), "each from the last equilibrium there was"
+    model.blind = False
+    state, said = run(state, facts, moody, 0.5)
+    assert said[-1].wrench.valid
+
+
+def test_what_is_held_on_to_ends_with_the_grip(moody: Parameters, hovering: Hovering) -> None:
+    model = moody.model
+    assert isinstance(model, Moody)
+    facts = hovering(BENT)
+    state, _ = run(moving(moody, facts), facts, moody, 1.0)
+    model.blind = True
+    state = dataclasses.replace(state, phase=Phase.UNLOAD, since=state.t, offset=(0.0, 0.0, 0.0))
+    state, _ = run(state, facts, moody, 1.0)
+    assert norm(state.lean) == 0.0
