@@ -190,6 +190,7 @@ def _record_builder(cls: Any) -> Callable[[Any], Any]:
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _builder(hint)) != _same]
     every = dataclasses.fields(cls)
     defaults = {f.name: f.default for f in every if f.default is not dataclasses.MISSING}
+    bare = not hasattr(cls, "__slots__") and not hasattr(cls, "__post_init__")
 
     def make(table: dict[str, Any]) -> Any:
         if not table.keys() <= names:
@@ -203,6 +204,6 @@ def _record_builder(cls: Any) -> Callable[[Any], Any]:
         for name, each in others:
             if name in table:
                 value[name] = each(table[name])
-        return of(cls, value)
+        return of(cls, value) if bare else cls(**value)
 
     return make
