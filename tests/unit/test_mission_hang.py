@@ -256,7 +256,7 @@ def test_no_cycle_lies_between_holding_and_hang_hold_in_which_the_arm_could_be_o
     [
         (vehicle(throttle_age_s=9.0), (), "throttle"),
         (vehicle(), ("limits.wrench_force_n=10.0",), "weight"),
-        (vehicle(), ("mount.rpy_deg=[0.0, 0.0, 0.0]",), "not above"),
+        (vehicle(), ("mount.rpy_deg=[0.0, 0.0, 0.0]", "limits.keep_out.half_angle_deg=0.0"), "not above"),
     ],
 )
 def test_a_hang_perch_is_refused_where_it_cannot_hang_and_an_anchor_perch_is_not(
