@@ -19,7 +19,7 @@ def echo(read_at: float) -> Echo:
 def test_whenever_between_question_and_answer_the_clock_was_read_it_is_the_same_servo(
     asked: list[tuple[float, float, float]],
 ) -> None:
-    record, now = ServoRecord(1, silent_after=10), 100.0
+    record, now = ServoRecord(1, missed=0), 100.0
     for pause, took, share in asked:
         question = now + pause
         now = question + took
@@ -30,7 +30,7 @@ def test_whenever_between_question_and_answer_the_clock_was_read_it_is_the_same_
 
 @given(st.floats(0.2, 1.0), st.floats(0.3, 30.0))
 def test_a_clock_that_started_afresh_shows(pause: float, ran: float) -> None:
-    record = ServoRecord(1, silent_after=10)
+    record = ServoRecord(1, missed=0)
     record.take_echo(echo(100.0), 99.999, 100.001)
     later = 100.0 + pause
     # it had run for `ran` seconds longer when it was switched off and on
@@ -41,7 +41,7 @@ def test_a_clock_that_started_afresh_shows(pause: float, ran: float) -> None:
 @pytest.mark.parametrize("late", [0.07, 0.5])
 def test_an_answer_that_waited_in_the_port_is_no_loss_of_power(late: float) -> None:
     """What a process that was not scheduled sees: the answer is there, and came who knows when."""
-    record = ServoRecord(1, silent_after=10)
+    record = ServoRecord(1, missed=0)
     for i, waited in enumerate((0.0, late, 0.0)):
         asked = 100.0 + i
         record.take_echo(echo(asked + 0.001), asked, asked + 0.002 + waited)
