@@ -9,7 +9,7 @@ usage: deb.sh [OPTION...]
 
 options:
   --output DIR     where the package goes (default: build)
-  --extras LIST    extras of the package, such as fast,mqtt (default: record,mqtt)
+  --extras LIST    extras of the package, such as fast,record,mqtt (default: record,mqtt)
   --python PYTHON  the interpreter of the system that the package is for (default: /usr/bin/python3)
   --arch ARCH      the machine that the package is for: amd64 or arm64 (default: this one)
   --help           this text

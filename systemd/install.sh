@@ -13,7 +13,7 @@ actions:
 
 options:
   --source DIR     the checkout to install from (default: the one this script is in)
-  --extras LIST    extras of the package, such as fast,mqtt (default: fast)
+  --extras LIST    extras of the package, such as fast,record,mqtt (default: fast,record)
   --python PYTHON  the interpreter that the virtual environment is made with (default: python3)
   --root DIR       install below DIR, touching nothing else; DESTDIR does the same
   --machine NAME   with --root: for another kind of machine, aarch64 or x86_64, from ready-made packages alone;
@@ -31,7 +31,7 @@ TEXT
 fail() { echo "install.sh: $*" >&2; exit 1; }
 misuse() { echo "install.sh: $*" >&2; usage >&2; exit 2; }
 
-ACTION=install ROOT=${DESTDIR:-} DRY= START= PURGE= VENV=yes EXTRAS=fast PYTHON=python3 MACHINE=
+ACTION=install ROOT=${DESTDIR:-} DRY= START= PURGE= VENV=yes EXTRAS=fast,record PYTHON=python3 MACHINE=
 SOURCE=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 while [ $# -gt 0 ]; do
     case $1 in

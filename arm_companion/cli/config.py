@@ -15,6 +15,7 @@ from arm_companion.config.options import spelling
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.errors import ConfigError
+from arm_companion.record import check_installed
 
 _EPILOG = """\
 Where values come from, the last one wins: the file and those that it extends; drop-ins, which are the *.toml files in
@@ -67,6 +68,7 @@ def _check(arguments: argparse.Namespace) -> None:
     try:
         open_configured(config)
         check_flyable(config)
+        check_installed(config)
     except ConfigError as refused:
         print(f"{arguments.config}: usable, but not for the daemon: {refused}")
     else:

@@ -3,7 +3,6 @@
 import argparse
 import asyncio
 import logging
-import sys
 from pathlib import Path
 
 from arm_companion.app import Daemon, open_configured
@@ -12,6 +11,7 @@ from arm_companion.clock import Clock, precise_loop, unix_now
 from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.settings import state_directory, with_kept_changes
 from arm_companion.drivers.standard_services import Power
+from arm_companion.service_log import log_to_stderr
 from arm_companion.supervisor import ServiceManager, stop_on_signals, take_priority
 
 log = logging.getLogger(__name__)
@@ -29,11 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the daemon until SIGTERM or SIGINT; exit code 0 after an orderly stop, 75 when it is to be started again."""
-    logging.basicConfig(
-        level=logging.DEBUG if arguments.verbose else logging.INFO,
-        format="%(levelname)s %(name)s: %(message)s",
-        stream=sys.stderr,
-    )
+    log_to_stderr(verbose=arguments.verbose)
     config = with_kept_changes(load_from(arguments))
 
     for words in take_priority():

@@ -1,5 +1,6 @@
 """Checks of the configuration beyond single values: what `run` would refuse, and what it takes but should not."""
 
+import importlib.util
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -13,6 +14,7 @@ from arm_companion.drivers.field_page import check_token
 from arm_companion.drivers.mqtt_publisher import check_files
 from arm_companion.drivers.signing_keys import read_key
 from arm_companion.errors import ConfigError
+from arm_companion.record import check_installed
 
 
 def configuration(subject: Subject) -> Iterator[Outcome]:
@@ -30,6 +32,7 @@ def configuration(subject: Subject) -> Iterator[Outcome]:
         yield fail("no link has the role autopilot", 'add one: [links.autopilot] with url and role = "autopilot"')
     if config.arm.segments:
         yield fail("an arm of several segments cannot be flown yet", "remove [[arm.segments]]")
+    yield from _extras(config)
     yield from _keys(config)
     yield ok(f"{config.vehicle.autopilot}, {len(config.links)} links, {len(config.servos.ids)} servos")
 
@@ -48,6 +51,15 @@ def access(subject: Subject) -> Outcome:
         )
     who = ", ".join(map(str, config.vehicle.commanders)) or "whoever signs"
     return ok(f"commands are taken from: {who}")
+
+
+def _extras(config: Config) -> Iterator[Outcome]:
+    try:
+        check_installed(config)
+    except ConfigError as error:
+        yield fail(str(error), "install it, or remove [record]")
+    if config.mqtt.host and importlib.util.find_spec("aiomqtt") is None:
+        yield warn("mqtt: nothing would be published, aiomqtt is missing", "pip install 'arm-companion[mqtt]'")
 
 
 def _keys(config: Config) -> Iterator[Outcome]:

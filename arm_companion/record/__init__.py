@@ -24,6 +24,23 @@ def require() -> None:
         raise RecordError(f"records need {' and '.join(missing)}: pip install 'arm-companion[record]'")
 
 
+def check_installed(config: Config) -> None:
+    """Refuse a configuration that records where nothing can.
+
+    Raises:
+        ConfigError: what writes records is not installed; the message says what to do.
+    """
+    if config.record.file or config.record.directory:
+        _check_installed()
+
+
+def _check_installed() -> None:
+    try:
+        require()
+    except RecordError as error:
+        raise ConfigError(f"record: {error}") from None
+
+
 def configured_recorder(config: Config, clock: Clock) -> Recorder:
     """What [record] asks for.
 
@@ -46,10 +63,7 @@ def open_recorder(path: Path, config: Config, clock: Clock, *, patient: bool = F
     Raises:
         ConfigError: what writes records is not installed.
     """
-    try:
-        require()
-    except RecordError as error:
-        raise ConfigError(f"record: {error}") from None
+    _check_installed()
     from arm_companion.record.file_recorder import FileRecorder  # noqa: PLC0415 - of an extra
     from arm_companion.record.versions import versions  # noqa: PLC0415
 

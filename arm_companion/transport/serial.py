@@ -138,6 +138,8 @@ def open_serial(port: str, baud: int) -> Opener:
             reason: object = error
             if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
                 reason = "another program holds its lock (the daemon, or another command on the servo bus)"
+            elif isinstance(error, OSError) and error.errno:
+                reason = os.strerror(error.errno)
             raise LinkError(f"cannot open {port} at {baud} bit/s: {reason}") from error
         _prefer_latency(device)
         return SerialPort(device, receiver)

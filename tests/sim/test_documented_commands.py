@@ -24,6 +24,7 @@ from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_ti
 from tests.documentation import ALONE, BEGIN, COMMANDS, IN_A_WORLD, ON_A_BUS, ROOT, group, words_of
 
 LONG_S = 900.0
+NOT_HEARD = 3
 EXTENDS_SIM = f'extends = "{ROOT}/configs/sim.toml"\n'
 # Each command with ports: in a network of its own where the system allows it, as someone may use the same ports
 _OWN_NETWORK = """
@@ -136,6 +137,8 @@ def _visit(place: str) -> None:
             watching = line.startswith("ground watch")
             words = ["timeout", "--preserve-status", "-s", "INT", "12", *command(line)] if watching else command(line)
             done = run(words, folder, 120.0)
+            if done.returncode == NOT_HEARD:  # a busy machine
+                done = run(words, folder, 120.0)
             expected = 1 if "perch" in line or "release" in line else 0  # the vehicle is on the ground
             sys.stdout.write(f"{line}: {done.returncode}\n{done.stdout}{done.stderr}\n")
             assert done.returncode == expected, line

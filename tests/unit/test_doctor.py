@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import importlib.util
 import json
 import os
 import socket
@@ -429,3 +430,21 @@ def test_a_daemon_that_really_runs_is_seen_and_left_alone(tmp_path: Path) -> Non
         process.kill()
         process.communicate()
     assert process.pid not in command.machine().daemons()
+
+
+def test_what_the_configuration_needs_and_is_not_installed_is_told(
+    subject: Subject, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importlib.util.find_spec
+    gone: set[str] = set()
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: None if name in gone else real(name, *rest))
+    publishes = with_(subject, config={"mqtt": MqttConfig(host="localhost")})
+    assert found(publishes, "configuration").level is Level.OK
+    gone.add("aiomqtt")
+    assert found(publishes, "configuration").level is Level.WARN
+    assert found(subject, "configuration").level is Level.OK
+    gone.add("mcap")
+    told = found(subject, "configuration")
+    assert told.level is Level.FAIL
+    assert "arm-companion[record]" in told.found
+    assert found(with_(subject, config={"record": RecordConfig()}), "configuration").level is Level.OK

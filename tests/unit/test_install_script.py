@@ -1,6 +1,7 @@
 """systemd/install.sh in a scratch root: what it lays down and takes away; a second run changes nothing."""
 
 import os
+import re
 import subprocess
 from pathlib import Path
 
@@ -71,6 +72,17 @@ def test_the_configuration_that_it_lays_down_can_be_used(tmp_path: Path) -> None
     open_configured(config)
     config.check_servos()
     assert [link.role for link in config.links.values()] == ["autopilot"]
+
+
+@pytest.mark.parametrize("script", ["install.sh", "deb.sh"])
+def test_what_is_installed_by_default_suffices_for_the_configuration_that_comes_with_it(script: str) -> None:
+    from arm_companion.config import load
+
+    config = load(SCRIPT.parent / "config.toml")
+    help_text = subprocess.run([SCRIPT.parent / script, "--help"], capture_output=True, text=True, check=True).stdout
+    (extras,) = re.findall(r"--extras LIST .*\(default: (.*)\)", help_text)
+    assert ("record" in extras.split(",")) or not (config.record.directory or config.record.file)
+    assert ("mqtt" in extras.split(",")) or not config.mqtt.host
 
 
 @pytest.mark.parametrize("again", ["install", "upgrade"])
