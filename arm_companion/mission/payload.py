@@ -35,6 +35,9 @@ _PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line throu
 _PRIOR_DRAG = 0.14  # 1/s
 _PRIOR_SIGMA = (1.0, 0.35, 0.1)  # of a, m/s^2; of the slope, in the same terms; of the drag
 _LEAST_SHARE = 0.05  # rotors that idle say nothing
+_CLIMB_M_PER_S = (
+    0.15  # by which a take-off is known: PX4 says that it flies while its rotors still spin up on the ground
+)
 _UPRIGHT = 0.7  # cosine of the greatest tilt at which a hover is a hover
 _SETTLE_S = 1.0  # after the take-off or a gap, until the filter and the ground are left behind
 _GAINS = (0.7, 2.0)  # what a curve of rotors can do
@@ -141,6 +144,7 @@ class Load:
         weighed_s: length of that mean, s.
         grip: tension of the tightest tendon while carrying, N, smoothed.
         light_s: how long `now` has been too little for the mean.
+        grounded: the vehicle has been seen to stand, and has not climbed since.
     """
 
     curve: ThrustCurve | None = None
@@ -152,6 +156,7 @@ class Load:
     weighed_s: float = 0.0
     grip: float = 0.0
     light_s: float = 0.0
+    grounded: bool = False
 
     @property
     def known(self) -> bool:
@@ -204,13 +209,15 @@ def watch_load(old: Load, vehicle: VehicleState, mass: float, dt: float, *, lift
     if dt <= 0.0:
         return old
     up = -rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))[2]
-    flying = vehicle.armed and not vehicle.landed and up > _UPRIGHT
-    if not (flying and vehicle.thrust > _LEAST_SHARE):  # also where the thrust is nan
-        return replace(interrupted(old), curve=None if old.curve is None else old.curve.forget(dt))
+    stands = not vehicle.armed or vehicle.landed
+    grounded = stands or (old.grounded and not vehicle.velocity_w[2] < -_CLIMB_M_PER_S)
+    if grounded or not (up > _UPRIGHT and vehicle.thrust > _LEAST_SHARE):  # also where the thrust is nan
+        curve = None if old.curve is None else old.curve.forget(dt)
+        return replace(interrupted(old), curve=curve, grounded=grounded)
     new = Flow(up, up * vehicle.thrust, vehicle.velocity_w[2])
     flow, seen_s, curve = _filtered(old.flow or new, new, dt), old.seen_s + dt, old.curve
     if seen_s < _SETTLE_S:
-        return replace(old, flow=flow, seen_s=seen_s, now=math.nan)
+        return replace(old, flow=flow, seen_s=seen_s, now=math.nan, grounded=False)
     felt = GRAVITY - _POLE * (new.sink - flow.sink)
     if lifted is not None:
         curve = (curve or ThrustCurve.prior(flow.push / flow.up)).learn(flow, felt * (1.0 + lifted / mass), dt)

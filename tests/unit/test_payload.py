@@ -99,6 +99,28 @@ def test_a_load_is_weighed_within_a_few_per_cent_on_a_curve_that_nobody_told() -
     assert 0.005 < load.sigma(MASS) < 0.03
 
 
+def test_rotors_that_spin_up_on_the_ground_say_nothing_though_the_autopilot_says_that_it_flies() -> None:
+    """PX4: not landed from a fifth of the thrust on, and two seconds later it lifts off (seen on SITL)."""
+    standing = VehicleState(armed=True, landed=True, thrust=0.1)
+    load = watch_load(NO_LOAD, standing, MASS, DT, lifted=0.0)
+    for i in range(200):
+        load = watch_load(load, VehicleState(armed=True, landed=False, thrust=0.2 + 0.0018 * i), MASS, DT, lifted=0.0)
+    assert load.curve is None
+    rotors = Rotors()
+    load = climb_and_hover(rotors, load)
+    assert load.calibrated
+    load = carry(rotors, load, 0.2)
+    assert load.mass == pytest.approx(0.2, rel=0.07)
+
+
+def test_a_daemon_that_starts_in_flight_does_not_wait_for_a_take_off() -> None:
+    load = NO_LOAD
+    rotors = Rotors()
+    for _ in range(300):
+        load = watch_load(load, rotors.step(0.0, 0.0), MASS, DT, lifted=0.0)
+    assert load.curve is not None
+
+
 def test_nothing_weighs_nothing() -> None:
     rotors = Rotors()
     load = carry(rotors, climb_and_hover(rotors), 0.0)
