@@ -1,4 +1,4 @@
-"""Writes the generated diagram of the perches: `python -m arm_companion.mission.diagram > docs/perch_states.md`."""
+"""Writes the diagram of perches and grasp: `python -m arm_companion.mission.diagram > docs/perch_states.md`."""
 
 from arm_companion.mission.machine import mermaid
 from arm_companion.mission.perch import TABLE
@@ -6,8 +6,8 @@ from arm_companion.mission.state import Phase
 
 HEADER = """# States of perches and grasp
 
-Made from the transition table in `arm_companion/mission/perch.py` and `hang.py`; a test fails when the two differ.
-Aborts are marked ✗. Rows are tried from the table's top, so aborts win over progress.
+Made from the transition table in `perch.py`, `hang.py` and `grasp.py` of `arm_companion/mission/`; a test fails when
+the two differ. Aborts are marked ✗. Rows are tried from the table's top, so aborts win over progress.
 
 """
 
