@@ -39,6 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
     require()
     from arm_companion.record.reader import Reader  # noqa: PLC0415 - after the check for the extra
     from arm_companion.record.replay import replay, summary  # noqa: PLC0415
+    from arm_companion.record.shares import replay_in_shares  # noqa: PLC0415
 
     asks = bool(arguments.config or arguments.settings)
     other = load(arguments.config, arguments.settings) if arguments.config else None
@@ -49,7 +50,10 @@ def run(arguments: argparse.Namespace) -> int:
         return from_table(as_table(config), "recorded configuration", arguments.settings)
 
     started = time.perf_counter()
-    outcome = replay(Reader(arguments.log), change=change if asks else None, mechanics=arguments.mechanics or "")
+    mechanics = arguments.mechanics or ""
+    outcome = None if asks else replay_in_shares(arguments.log, mechanics)
+    if outcome is None:
+        outcome = replay(Reader(arguments.log), change=change if asks else None, mechanics=mechanics)
     wall = time.perf_counter() - started
     if arguments.json:
         print(json.dumps(summary(outcome) | {"wall_s": round(wall, 3)}))

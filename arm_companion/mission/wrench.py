@@ -49,13 +49,8 @@ def predict(s: Situation) -> Prediction:
     period = 1.0 / max(s.config.rates.wrench_hz, _LEAST_HZ)
     if last is not None and s.t - last.t < period - 0.5 * s.dt and s.state.since < s.t:
         return last
-    free = held = None
-    with suppress(ModelError):
-        free = _free(s, None if last is None else last.free)
-    holding = s.state.phase in _ANCHORED and s.state.anchor is not None and not s.grasping
-    if holding:
-        with suppress(ModelError):
-            held = anchored(s, s.state.position, None if last is None else last.anchored)
+    free, held = equilibria(s)
+    holding = _holding(s)
     solution = held if holding else free
     tip = _NAN3 if free is None else _vec3(free.tip_position)
     return Prediction(
@@ -69,6 +64,23 @@ def predict(s: Situation) -> Prediction:
         held,
         _stiffness(s, solution),
     )
+
+
+def equilibria(s: Situation) -> tuple[ArmSolution | None, ArmSolution | None]:
+    """The free arm, and the anchored one while something is; each from the last one on, None where none was found."""
+    last = s.state.prediction
+    free = held = None
+    with suppress(ModelError):
+        free = _free(s, None if last is None else last.free)
+    if _holding(s):
+        with suppress(ModelError):
+            held = anchored(s, s.state.position, None if last is None else last.anchored)
+    return free, held
+
+
+def _holding(s: Situation) -> bool:
+    """Whether the arm is an anchor for the vehicle."""
+    return s.state.phase in _ANCHORED and s.state.anchor is not None and not s.grasping
 
 
 def _free(s: Situation, start: ArmSolution | None) -> ArmSolution:

@@ -114,7 +114,7 @@ def replay(reader: Reader, *, change: Change | None = None, mechanics: str = "")
     if change is not None:
         outcome.why.insert(0, "the configuration is another one")
     wanted = mechanics or reader.versions.get("mechanics", "numpy")
-    runner = _Runner(outcome, change, _mechanics(wanted, reader.versions.get("mechanics", ""), outcome.why))
+    runner = Runner(outcome, change, mechanics_of(wanted, reader.versions.get("mechanics", ""), outcome.why))
     for found in cycles(reader):
         if isinstance(found, Cycle):
             runner.take(found)
@@ -154,43 +154,49 @@ def cycles(reader: Reader) -> Iterator[Cycle | Config]:
             yield Cycle(item.sequence, t, facts, parts[STATE].data if STATE in parts else b"", item.data)
 
 
-class _Runner:
-    """Memory and parameters of a replay while it runs."""
+class Runner:
+    """Memory and parameters of a replay while it runs.
+
+    Attributes:
+        parameters: as configured last; None before that.
+        state: memory after the last cycle; None before the first.
+        start: loop time of the first cycle, s.
+    """
 
     def __init__(self, outcome: Outcome, change: Change | None, fast: bool) -> None:
         self._outcome = outcome
         self._change = change
         self._fast = fast
-        self._parameters: Parameters | None = None
-        self._state: State | None = None
         self._next = 0
-        self._start = 0.0
+        self.parameters: Parameters | None = None
+        self.state: State | None = None
+        self.start = 0.0
 
     def configure(self, config: Config) -> None:
         """From here on with this configuration."""
         if self._change is not None:
             config = self._change(config)
-        old = self._parameters
+        old = self.parameters
         model: ArmModel
         if old is not None and old.config.arm == config.arm:
             model = old.model
         else:
             model = RodModel(ArmParameters.of(config.arm), fast=self._fast)
-        self._parameters = Parameters(config, model)
+        self.parameters = Parameters(config, model)
 
     def take(self, cycle: Cycle) -> None:
         """Run one cycle and compare."""
         outcome = self._outcome
-        if self._parameters is None:
+        if self.parameters is None:
             raise RecordError("the record has no configuration before its first cycle")
-        if self._state is None or cycle.number != self._next:
+        if self.state is None or cycle.number != self._next:
             self._resume(cycle)
         self._next = cycle.number + 1
         outcome.cycles += 1
-        seconds = outcome.seconds = cycle.t - self._start
-        state = self._state or State()
+        seconds = outcome.seconds = cycle.t - self.start
+        state = self.state or State()
         try:
-            self._state, commands = step(state, cycle.facts, cycle.t, self._parameters)
+            self.state, commands = step(state, cycle.facts, cycle.t, self.parameters)
         except Exception as error:  # noqa: BLE001 - as in the daemon: the cycle fails, the next one comes
             outcome.failures.append((cycle.number, f"{type(error).__name__}: {error}"))
             self._note_first(cycle, seconds, "", "commands", f"{type(error).__name__}: {error}")
@@ -206,19 +212,23 @@ class _Runner:
             return
         self._compare(cycle, orjson.loads(cycle.commands), orjson.loads(now), seconds)
 
+    def resume(self, state: State, number: int) -> None:
+        """Go on at this cycle with other memory."""
+        self.state, self._next = state, number
+
     def _resume(self, cycle: Cycle) -> None:
         """Memory as recorded: at the first cycle, and where some are missing."""
-        if self._state is None:
-            self._start = cycle.t
+        if self.state is None:
+            self.start = cycle.t
             if cycle.number:
                 self._outcome.remarks.append(f"its first {cycle.number} cycles are missing")
         else:
             self._outcome.gaps.append((self._next, cycle.number - self._next))
         try:
-            self._state = build(State, orjson.loads(cycle.state)) if cycle.state else self._state or State()
+            self.state = build(State, orjson.loads(cycle.state)) if cycle.state else self.state or State()
         except ValueError as error:
             raise RecordError(f"cycle {cycle.number}: memory of another version: {error}") from None
-        if cycle.number and self._state.prediction is not None:
+        if cycle.number and self.state.prediction is not None:
             self._outcome.why.append(
                 "cycles are missing: where the solver starts is not recorded, so last bits may differ after the gap"
             )
@@ -279,7 +289,7 @@ def _distance(a: Any, b: Any) -> float:
     return math.dist(a, b)
 
 
-def _mechanics(wanted: str, recorded: str, why: list[str]) -> bool:
+def mechanics_of(wanted: str, recorded: str, why: list[str]) -> bool:
     """Whether to run compiled mechanics."""
     fast = wanted == "numba"
     if fast:

@@ -1,6 +1,7 @@
 """Replay of the golden flight, what-if, and the page for people."""
 
 import dataclasses
+import itertools
 import json
 import re
 from html.parser import HTMLParser
@@ -11,14 +12,31 @@ import orjson
 import pytest
 
 from arm_companion.__main__ import main
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import Config
+from arm_companion.config.table import as_table
 from arm_companion.mission import mission
+from arm_companion.mission.situation import Parameters
+from arm_companion.mission.state import State
 from arm_companion.record import replay as replay_module
+from arm_companion.record import shares
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.reader import Reader, truth_beside
 from arm_companion.record.replay import differences, replay
-from arm_companion.record.topics import COMMANDS, FORMAT, LOG, TRANSITIONS, TRUTH, transition
+from arm_companion.record.topics import (
+    COMMANDS,
+    CONFIGURATION,
+    FACTS,
+    FORMAT,
+    LOG,
+    STATE,
+    TRANSITIONS,
+    TRUTH,
+    transition,
+)
 from arm_companion.record.versions import versions
+from arm_companion.record_codec import plain
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "perch.mcap"
 
@@ -78,6 +96,57 @@ def test_a_gap_is_told_and_replay_goes_on_behind_it(tmp_path: Path) -> None:
     outcome = replay(Reader(path))
     assert outcome.gaps == [(20, 5)]
     assert outcome.cycles == 35
+
+
+def remembered(target: Path, cycles: int, *, spoilt: int | None = None) -> None:
+    """The golden flight's beginning with the memory before every cycle, as the daemon writes it.
+
+    Args:
+        target: written.
+        cycles: how many.
+        spoilt: the cycle whose commands are not those that follow.
+    """
+    reader = Reader(GOLDEN)
+    file = McapFile(target, reader.versions)
+    state, parameters = State(), None
+    for found in itertools.islice(replay_module.cycles(reader), cycles + 1):
+        if isinstance(found, Config):
+            parameters = Parameters(found, RodModel(ArmParameters.of(found.arm)))
+            file.json(CONFIGURATION, 0, {"t": 0.0, "config": as_table(found)})
+            continue
+        assert parameters is not None
+        file.json(STATE, 0, plain(state), found.number)
+        state, commands = mission.step(state, found.facts, found.t, parameters)
+        if found.number == spoilt:
+            commands = dataclasses.replace(commands, recover=True)
+        file.json(FACTS, 0, {"t": found.t} | plain(found.facts), found.number)
+        file.json(COMMANDS, 0, {"t": found.t} | plain(commands), found.number)
+    file.close()
+
+
+def test_shares_are_together_the_whole_replay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(shares, "_STRETCH", 40)
+    path = tmp_path / "r.mcap"
+    remembered(path, 150)
+    whole = replay(Reader(path))
+    assert whole.identical
+    parts = [shares.share(path, "", 2, k) for k in range(2)]
+    assert [part and part.cycles for part in parts] == [80, 70]
+    moves = [move for part in parts if part is not None for move in part.recorded]
+    assert sorted(moves, key=lambda move: move.seconds) == whole.recorded
+    assert {move.after for move in moves} >= {"STOWED", "READYING", "READY"}
+
+
+@pytest.mark.parametrize("spoilt", [10, 60])
+def test_a_share_that_finds_a_difference_says_nothing(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, spoilt: int
+) -> None:
+    monkeypatch.setattr(shares, "_STRETCH", 40)
+    path = tmp_path / "r.mcap"
+    remembered(path, 90, spoilt=spoilt)
+    assert shares.share(path, "", 2, spoilt // 40) is None
+    copy(path, upto=90)  # without memory
+    assert None in [shares.share(path, "", 2, k) for k in range(2)]
 
 
 def test_what_another_configuration_would_have_done(capsys: pytest.CaptureFixture[str]) -> None:
