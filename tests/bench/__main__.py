@@ -14,6 +14,7 @@ from tests.bench.listening import listening
 from tests.bench.measure import Result
 from tests.bench.mechanics import mechanics
 from tests.bench.protocols import protocols
+from tests.bench.replaying import replaying
 from tests.bench.servo_cycle import servo_cycle
 
 
@@ -24,7 +25,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results: list[Result] = []
     _say(f"{'':<44}{'ours':>11} {'unit':<6}{'peer':>11}  {'ratio':>8}  beside")
-    for part in (mechanics, protocols, servo_cycle, lambda _: listening()):
+    for part in (mechanics, protocols, replaying, servo_cycle, lambda _: listening()):
         for result in part(arguments.rounds):
             results.append(result)
             _say(result.line())
