@@ -130,8 +130,8 @@ class _Way:
         state = build(State, table)
         if solved and state.prediction is not None and self.runner.parameters is not None:
             s = Situation(replace(state, prediction=self._solved), cycle.facts, cycle.t, self.runner.parameters)
-            free, anchored, _ = equilibria(s)
-            self._solved = replace(state.prediction, free=free, anchored=anchored)
+            free, known, _ = equilibria(s)
+            self._solved = replace(state.prediction, free=free, anchored=known)
         if mine_is_next:
             self.runner.resume(replace(state, prediction=self._solved), cycle.number + 1)
         return True
