@@ -55,7 +55,10 @@ SCENARIOS: Mapping[str, Scenario] = {
         fly_one_abort,
     ),
     "gust": Scenario(
-        "Anchor perch in gusts", "perched and let go", fly_in_gusts, lambda flight, failure, _: judge(flight, failure)
+        "Anchor perch in gusts",
+        "perched and let go",
+        fly_in_gusts,
+        lambda flight, failure, _: judge(flight, failure, leaning=True),
     ),
     "grasp": Scenario("Grasp", "grasped and put back", Operator.fly_grasp, judge_grasp, Operator.fly_grasp_once),
 }

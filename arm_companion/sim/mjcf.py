@@ -24,6 +24,7 @@ NED_TO_UP = (1.0, -1.0, -1.0)  # diagonal of the half turn about x, its own inve
 
 AIRFRAME = "airframe"
 FLIGHT = "flight"
+MOUNT = "mount"
 ARM_BASE = "arm base"
 BAR = "bar"
 OBJECT = "object"
@@ -219,7 +220,7 @@ def _airframe(config: Config, stand: float) -> str:
     lines = [
         f'<inertial pos="0 0 0" mass="{mass}" diaginertia="{_join(inertia)}"/>',
         f'<geom type="box" size="{_join(_BODY_HALF_SIZE)}" {solid}/>',
-        f'<geom type="cylinder" size="{config.arm.pitch_radius_m}" fromto="{neck}" {solid}/>',
+        f'<geom name="{MOUNT}" type="cylinder" size="{config.arm.pitch_radius_m}" fromto="{neck}" {solid}/>',
     ]
     for i, (sx, sy) in enumerate(((1, 1), (1, -1), (-1, -1), (-1, 1))):
         lines.append(

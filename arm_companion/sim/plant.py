@@ -58,6 +58,7 @@ class Plant:
         self._ground = {0} if self._object < 0 else {0, model.body(mjcf.CRADLES).id}
         self._tip = model.site(mjcf.TIP).id
         self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
+        self._mount = model.geom(mjcf.MOUNT).id
         self._rotors = np.array([model.geom(mjcf.rotor(i)).id for i in range(4)])
         # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
         self._link_of_geom = np.full(model.ngeom, -1)
@@ -209,6 +210,8 @@ class Plant:
         ground = np.isin(bodies, list(self._ground))
         outside = np.any(ground | (bodies == self._bar), axis=1)
         thing = np.any(bodies == self._object, axis=1)
+        touching = outside & np.any(bodies == self._airframe, axis=1)
+        by_mount = np.any(data.contact.geom == self._mount, axis=1)
         tension = self.tensions()
         mujoco.mj_kinematics(model, data)  # the tip where it is after the step, as in `state`
         return PlantTruth(
@@ -219,7 +222,8 @@ class Plant:
             wrap_angle=wrap,
             tension=tension,
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
-            body_contact=bool(np.any(outside & np.any(bodies == self._airframe, axis=1))),
+            body_contact=bool(np.any(touching)),
+            mount_only=bool(np.any(touching) and np.all(by_mount[touching])),
             rotor_contact=bool(np.any(np.isin(data.contact.geom, self._rotors))),
             object_position_w=None if self._object < 0 else mjcf.up(data.xpos[self._object].tolist()),
             object_supported=bool(np.any(thing & np.any(ground, axis=1))),

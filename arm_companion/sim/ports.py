@@ -40,6 +40,7 @@ class PlantTruth:
     tension: tuple[float, ...]  # N, true tendon tensions
     tip_position_w: Vec3  # m
     body_contact: bool  # the airframe itself touches bar, object, cradles or ground
+    mount_only: bool = False  # of the airframe, nothing touches but the mount of the arm
     rotor_contact: bool = False  # something, the arm too, reaches into a propeller's disk
     object_position_w: Vec3 | None = None  # m, middle of the object; None: there is none
     object_supported: bool = False  # it touches cradles or ground

@@ -40,17 +40,7 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
     for name, seconds in verdict.states:
         table.add_row(f"in {name}", f"{seconds:.1f} s", "")
     table.add_section()
-    mean, most = verdict.contact_force_n
-    table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
-    table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
-    for wrench in verdict.wrench:
-        table.add_row(
-            f"wrench on airframe, {wrench.span}",
-            f"{wrench.force_error_n:.2f} N RMS error",
-            f"true {wrench.true_force_n:.2f} N; torque error {wrench.torque_error_nm:.3f} "
-            f"of {wrench.true_torque_nm:.3f} N m; "
-            f"{wrench.predictions} predictions",
-        )
+    _show_forces(verdict, table)
     table.add_section()
     if not math.isnan(verdict.hover_error_m):
         table.add_row("hover error while held", f"{_mm(verdict.hover_error_m)}", "RMS about the mean")
@@ -78,6 +68,23 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
     for path in files:
         if path.exists():
             console.print(f"  {path}", soft_wrap=True)
+
+
+def _show_forces(verdict: Verdict, table: Table) -> None:
+    """What touched what, and what the daemon predicted of it."""
+    mean, most = verdict.contact_force_n
+    table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
+    table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
+    for wrench in verdict.wrench:
+        table.add_row(
+            f"wrench on airframe, {wrench.span}",
+            f"{wrench.force_error_n:.2f} N RMS error",
+            f"true {wrench.true_force_n:.2f} N; torque error {wrench.torque_error_nm:.3f} "
+            f"of {wrench.true_torque_nm:.3f} N m; "
+            f"{wrench.predictions} predictions",
+        )
+    if verdict.leaned_s:
+        table.add_row("mount against the bar", f"{verdict.leaned_s:.1f} s", "no wrench of the arm: nobody predicts it")
 
 
 def _show_grasp(verdict: GraspVerdict, table: Table) -> None:

@@ -4,6 +4,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from arm_companion.sim.flight import Flight, Mark, WrenchSeen
 from arm_companion.sim.world import Sample
@@ -51,16 +52,18 @@ class Verdict:
     wrap_rad: float = 0.0
     wrench: list[WrenchError] = field(default_factory=list)
     moves: list[Move] = field(default_factory=list)
+    leaned_s: float = 0.0  # with nothing but the arm's mount against the bar
     hover_error_m: float = math.nan  # RMS about the mean while perched and not moved
     excursion_m: float = math.nan  # greatest distance from where it was asked to be while the arm lets go
 
 
-def judge(flight: Flight, failure: str) -> Verdict:
+def judge(flight: Flight, failure: str, *, leaning: bool = False) -> Verdict:
     """The verdict on a perch flight.
 
     Args:
         flight: what was seen.
         failure: why the operator's script ended early; empty when it went through.
+        leaning: whether the mount of the arm may touch the bar, as in gusts: in a closed wrap it is 3 mm away from it.
     """
     reasons = [failure] if failure else []
     spans = flight.spans()
@@ -71,7 +74,7 @@ def judge(flight: Flight, failure: str) -> Verdict:
     elif held < _HELD_SHARE:
         reasons.append(f"the arm held the bar only {held:.0%} of the time it said so")
     reasons += after(flight, perched=bool(perched))
-    reasons += unharmed(flight)
+    reasons += unharmed(flight, leaning=leaning)
     verdict = Verdict(not reasons, "perched" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
     verdict.states = [(name, end - start) for name, start, end in spans]
     if perched:
@@ -80,6 +83,7 @@ def judge(flight: Flight, failure: str) -> Verdict:
         verdict.wrap_rad = statistics.median(s.truth.wrap_angle for s in perched)
     verdict.wrench = wrench_errors(flight, {"free": ("READY", "APPROACH", "DEPART"), "perched": ("PERCHED",)})
     verdict.excursion_m = excursion(flight)
+    verdict.leaned_s = sum(b.t - a.t for a, b in pairwise(flight.samples) if a.truth.mount_only)
     still = next((mark for mark in flight.marks if mark.name == "hold"), None)
     if still is not None:
         verdict.hover_error_m = _spread(flight.within(still.start, still.end))
@@ -124,9 +128,13 @@ def excursion(flight: Flight) -> float:
     return max((math.dist(s.state.position_w, place) for s, place in asked), default=math.nan)
 
 
-def unharmed(flight: Flight) -> list[str]:
-    """What must never happen: the airframe touches bar or ground while it flies."""
-    touching = [s for s in flight.samples if s.state.position_w[2] < -_AIRBORNE_M and s.truth.body_contact]
+def unharmed(flight: Flight, *, leaning: bool = False) -> list[str]:
+    """What must never happen: the airframe, but its mount where it may lean, touches bar or ground while it flies."""
+    touching = [
+        s
+        for s in flight.samples
+        if s.state.position_w[2] < -_AIRBORNE_M and s.truth.body_contact and not (leaning and s.truth.mount_only)
+    ]
     if not touching:
         return []
     return [f"the airframe touched something in flight at {touching[0].t - flight.samples[0].t:.1f} s"]

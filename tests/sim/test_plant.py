@@ -299,6 +299,11 @@ def test_the_airframe_on_the_bar_is_body_contact() -> None:
     world.move_bar(beside(world, (0.18, 0.0, -0.08)))  # into the front rotors
     run(world, 0.01, HOVER)
     assert world.truth().body_contact
+    assert not world.truth().mount_only
+    world.move_bar(beside(world, (0.05, 0.0, 0.09)))  # against the mount
+    run(world, 0.01, HOVER)
+    assert world.truth().body_contact
+    assert world.truth().mount_only
 
 
 # --- the simulation itself ---
