@@ -244,6 +244,7 @@ def _trials(arguments: argparse.Namespace, config: Config) -> int:
             "failures": summary.failures,
             "interval_95": [round(low, 4), round(high, 4)],
             "harmed": summary.harmed,
+            "wrench_two_sigma_share": _number(summary.covered),
             "seed": config.sim.seed,
             "wall_s": round(time.perf_counter() - started, 3),
         }
@@ -301,7 +302,9 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
 
 def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
-    perched = next((w for w in verdict.wrench if w.span in ("perched", "hanging", "carried")), None)
+    from arm_companion.sim.verdict import HELD_SPANS  # noqa: PLC0415 - after the check for the extra
+
+    perched = next((w for w in verdict.wrench if w.span in HELD_SPANS), None)
     errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
     contract = {
@@ -311,6 +314,7 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
         "wrench_rms_error_n": _number(perched.force_error_n if perched else math.nan),
         "wrench_rms_n": _number(perched.true_force_n if perched else math.nan),
+        "wrench_two_sigma_share": _number(perched.covered if perched else math.nan),
         "pose_error_with_m": _number(errors.get("pull x", math.nan)),
         "pose_error_without_m": _number(errors.get("pull x, not compensated", math.nan)),
         "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],

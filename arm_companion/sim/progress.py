@@ -81,7 +81,7 @@ def _show_forces(verdict: Verdict, table: Table) -> None:
             f"{wrench.force_error_n:.2f} N RMS error",
             f"true {wrench.true_force_n:.2f} N; torque error {wrench.torque_error_nm:.3f} "
             f"of {wrench.true_torque_nm:.3f} N m; "
-            f"{wrench.predictions} predictions",
+            f"{wrench.covered:.0%} of {wrench.predictions} predictions within two sigma",
         )
     if verdict.leaned_s:
         table.add_row("mount against the bar", f"{verdict.leaned_s:.1f} s", "no wrench of the arm: nobody predicts it")
@@ -134,6 +134,8 @@ def show_summary(title: str, done: str, summary: Summary, stream: TextIO) -> Non
     share = f"{summary.success / trials:.0%}"
     table.add_row(done, str(summary.success), share, f"{low:.0%} to {high:.0%}")
     table.add_row("harm: limit, airframe or fall", str(summary.harmed), f"{summary.harmed / trials:.0%}", "")
+    if not math.isnan(summary.covered):
+        table.add_row("predicted force within two sigma", "", f"{summary.covered:.0%}", "of the held arm's, mean")
     table.add_section()
     for reason, count in summary.failures.items():
         table.add_row(reason.replace("[", "("), str(count), f"{count / trials:.0%}", "")

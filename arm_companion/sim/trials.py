@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import random
 import re
+import statistics
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
 from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.verdict import HELD_SPANS
 
 MODEL_ERROR = 0.1
 """Greatest relative difference between the plant and the controller's parameters."""
@@ -58,6 +60,8 @@ class Outcome:
     reason: str
     harm: str  # a limit broken, the airframe touched or the vehicle fell; empty: none
     words: str
+    covered: float = math.nan
+    """Share of the held arm's predicted forces within two sigma of the truth; nan: it never held."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +84,12 @@ class Summary:
     def failures(self) -> dict[str, int]:
         """How often each reason ended a trial, the most frequent first; figures in reasons are left out."""
         return dict(collections.Counter(kind(o.reason) for o in self.outcomes if not o.success).most_common())
+
+    @property
+    def covered(self) -> float:
+        """Mean share of the held arm's predicted forces within two sigma of the truth; nan: it never held."""
+        shares = [outcome.covered for outcome in self.outcomes if not math.isnan(outcome.covered)]
+        return statistics.fmean(shares) if shares else math.nan
 
     @property
     def harmed(self) -> int:
@@ -243,7 +253,8 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
     harm = [reason for reason in verdict.reason.split("; ") if any(word in reason for word in _HARM)]
     if most > _OVER * config.limits.tension_max_n:
         harm.append(f"a tendon carried {most:.1f} N")
-    return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words)
+    covered = next((w.covered for w in verdict.wrench if w.span in HELD_SPANS), math.nan)
+    return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words, covered)
 
 
 def fly(

@@ -9,6 +9,9 @@ from itertools import pairwise
 from arm_companion.sim.flight import Flight, Mark, WrenchSeen
 from arm_companion.sim.world import Sample
 
+HELD_SPANS = ("perched", "hanging", "carried")
+"""Spans of `wrench_errors` in which the arm holds something."""
+
 _HELD_SHARE = 0.95
 _HELD_WRAP_RAD = 2.0
 _HELD_FORCE_N = 0.05
@@ -27,6 +30,7 @@ class WrenchError:
     force_error_n: float
     true_torque_nm: float
     torque_error_nm: float
+    covered: float = math.nan  # share of all predictions and axes whose force is within two of its sigmas of the truth
 
 
 @dataclass(frozen=True)
@@ -167,6 +171,11 @@ def _wrench_error(flight: Flight, name: str, states: Sequence[str]) -> WrenchErr
         _rms([math.dist(w.force_b, s.truth.force_b) for w, s in pairs]),
         _rms([math.dist(s.truth.torque_b, (0, 0, 0)) for _, s in pairs]),
         _rms([math.dist(w.torque_b, s.truth.torque_b) for w, s in pairs]),
+        statistics.fmean(
+            abs(told - true) <= 2.0 * sigma
+            for w, s in pairs
+            for told, true, sigma in zip(w.force_b, s.truth.force_b, w.force_sigma, strict=True)
+        ),
     )
 
 

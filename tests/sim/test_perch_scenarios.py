@@ -134,7 +134,8 @@ def test_the_predicted_wrench_is_the_plants() -> None:
     _, verdict = perch()
     error = {wrench.span: wrench for wrench in verdict.wrench}
     assert error["free"].force_error_n < 0.15 * error["free"].true_force_n
-    assert error["perched"].force_error_n < error["perched"].true_force_n
+    assert error["perched"].force_error_n < 0.35 * error["perched"].true_force_n
+    assert error["perched"].covered > 0.9
 
 
 def test_no_cycle_is_missed_and_replay_gives_the_same_commands_bit_for_bit() -> None:

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from arm_companion.sim.flight import Flight
+from arm_companion.sim.flight import Flight, WrenchSeen
 from arm_companion.sim.ports import PlantTruth, RigidState
-from arm_companion.sim.verdict import excursion
+from arm_companion.sim.verdict import excursion, wrench_errors
 from arm_companion.sim.world import Sample
 
 ZERO = (0.0, 0.0, 0.0)
@@ -24,6 +24,18 @@ def flight(away: dict[float, float]) -> Flight:
         made.asked.append((t, (0.0, 0.0, -0.1 * t)))
         made.samples.append(Sample(t, replace(STILL, position_w=(north, 0.0, -0.1 * t)), TRUTH))
     return made
+
+
+def test_the_band_covers_what_lies_within_two_sigma_of_the_truth() -> None:
+    seen = flight({})
+    truth = replace(TRUTH, force_b=(1.0, 0.0, -2.0))
+    seen.samples = [replace(sample, truth=truth) for sample in seen.samples]
+    sigma = (0.1, 0.2, 0.3)
+    for t, told in ((1.0, (1.1, 0.3, -1.5)), (2.0, (1.3, 0.5, -2.0)), (3.0, (9.0, 9.0, 9.0))):
+        seen.wrenches.append(WrenchSeen(t, told, ZERO, sigma, t < 3.0, 2))
+    (error,) = wrench_errors(seen, {"perched": ("PERCHED",), "free": ("READY",)})
+    assert error.predictions == 2, "what is not valid does not count"
+    assert error.covered == pytest.approx(4 / 6)
 
 
 def test_the_excursion_is_counted_from_the_place_asked_while_the_arm_lets_go() -> None:
