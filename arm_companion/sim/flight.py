@@ -69,7 +69,9 @@ class Flight:
     end: float = 0.0
 
     def spans(self) -> list[tuple[str, float, float]]:
-        """Name, entry and exit of every state passed."""
+        """Name, entry and exit of every state passed; none where the arm was never heard."""
+        if not self.states:
+            return []
         times = [t for t, _ in self.states[1:]] + [self.end]
         return [(name, start, end) for (start, name), end in zip(self.states, times, strict=True)]
 

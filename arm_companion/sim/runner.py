@@ -32,6 +32,7 @@ from arm_companion.transport.memory import MemoryPipe
 from arm_companion.transport.urls import open_url
 
 _STOP_WITHIN_S = 5.0
+_HOPELESS_S = 5.0
 Prepare = Callable[[World], None]
 Script = Callable[[Operator], Coroutine[Any, Any, str]]
 
@@ -146,16 +147,28 @@ async def fly_real_time(
     async with _in_real_time(world, config), _running(link.run), _daemon_process(daemon_arguments, log) as daemon:
         operator = asyncio.create_task(fly(Operator(link, config, flight, say)))
         died = asyncio.create_task(daemon.wait())
-        await asyncio.wait({operator, died}, return_when=asyncio.FIRST_COMPLETED)
-        if not operator.done():
+        behind = asyncio.create_task(_falls_behind(world))
+        done, _ = await asyncio.wait({operator, died, behind}, return_when=asyncio.FIRST_COMPLETED)
+        if operator in done:
+            failure = operator.result()
+        else:
             operator.cancel()
             await asyncio.gather(operator, return_exceptions=True)
-            raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+            if died in done:
+                raise DaemonDied(f"the daemon ended with code {died.result()}; see {log}")
+            failure = "this machine is too slow for real time"
+            flight.end = asyncio.get_running_loop().time()
         died.cancel()
-        failure = operator.result()
+        behind.cancel()
     if world.lost_s > 0.0:
         say(f"this machine was too slow: the physics lost {world.lost_s:.2f} s")
     return Result(flight, failure, lost_s=world.lost_s, poses=world.poses)
+
+
+async def _falls_behind(world: World) -> None:
+    """Return once the physics have lost so much time that a flight in them is none."""
+    while world.lost_s < _HOPELESS_S:  # noqa: ASYNC110 - the physics count, and wake nobody
+        await asyncio.sleep(0.1)
 
 
 async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say: Say, stop: asyncio.Event) -> None:

@@ -18,6 +18,11 @@ from typing import Any
 
 import pytest
 
+from arm_companion.__main__ import main
+from arm_companion.cli.sim import TOO_SLOW
+from arm_companion.sim import runner
+from arm_companion.sim.world import World as Simulated
+
 pytestmark = pytest.mark.realtime
 
 READY, STOW, PERCH, RELEASE = 64000, 64001, 64002, 64004
@@ -265,3 +270,33 @@ def test_a_daemon_that_ends_early_is_told_in_one_line_and_not_as_a_traceback(tmp
     assert ended.returncode == 1
     assert "the daemon ended with code 78" in ended.stderr
     assert "Traceback" not in ended.stderr
+
+
+def test_a_flight_ends_as_soon_as_the_machine_is_hopelessly_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runner, "_HOPELESS_S", 0.5)
+    advance = Simulated._advance
+
+    def slow(late: Simulated) -> None:
+        time.sleep(0.02)  # four milliseconds of flight in twenty
+        advance(late)
+
+    monkeypatch.setattr(Simulated, "_advance", slow)
+    ports = [free_port() for _ in range(3)]
+    words = ["sim", "perch", "--output", str(tmp_path)]
+    for setting in (
+        f"links.autopilot.url=udpin:127.0.0.1:{ports[0]}",
+        f"sim.autopilot_url=udpout:127.0.0.1:{ports[0]}",
+        f"sim.operator_autopilot_url=udpin:127.0.0.1:{ports[1]}",
+        f"links.ground.url=udpout:127.0.0.1:{ports[2]}",
+        f"sim.operator_arm_url=udpin:127.0.0.1:{ports[2]}",
+        f"servos.port={tmp_path / 'bus'}",
+    ):
+        words += ["--set", setting]
+    begun = time.monotonic()
+    assert main(words) == TOO_SLOW
+    assert time.monotonic() - begun < 25.0
+    said = capsys.readouterr()
+    assert "too slow for real time" in said.out
+    assert "behind real time" in said.err
