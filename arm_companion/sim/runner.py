@@ -215,16 +215,21 @@ async def _running(*tasks: Callable[[], Awaitable[None]]) -> AsyncIterator[None]
     async def run(task: Callable[[], Awaitable[None]]) -> None:
         await task()
 
-    failure: ArmError | None = None
-    async with asyncio.TaskGroup() as group:
-        running = [group.create_task(run(task)) for task in tasks]
-        try:
-            yield
-        except ArmError as error:  # the block's own failure, which the group would wrap
-            failure = error
-        finally:
-            for task in running:
-                task.cancel()
+    failure: BaseException | None = None
+    try:
+        async with asyncio.TaskGroup() as group:
+            running = [group.create_task(run(task)) for task in tasks]
+            try:
+                yield
+            except ArmError as error:  # the block's own failure, which the group would wrap
+                failure = error
+            finally:
+                for task in running:
+                    task.cancel()
+    except* ArmError as several:  # of a task, such as a flight stack that has ended: one is enough to tell
+        failure = several
+        while isinstance(failure, BaseExceptionGroup):
+            failure = failure.exceptions[0]
     if failure is not None:
         raise failure
 

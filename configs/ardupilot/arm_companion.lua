@@ -12,7 +12,7 @@ and the mission goes on when the arm has finished, has failed, or the time is up
 Commands: 1 READY, 2 STOW, 3 PERCH (argument: kind, 0 is the anchor perch), 4 RELEASE, 5 ABORT.
 
 Parameters of this script: ARMC_COMP is the arm's component id, ARMC_CHAN the MAVLink channel of the companion computer
-(0 is the first MAVLink port; -1 is all).
+(0 is the first MAVLink port; -1 is the one on which the arm is heard).
 ]]
 
 local COMMAND_LONG, COMMAND_ACK, HEARTBEAT = 76, 77, 0
@@ -23,7 +23,6 @@ local NAMES = { "READY", "STOW", "PERCH", "RELEASE", "ABORT" }
 local SEVERITY_WARNING, SEVERITY_INFO = 4, 6
 local LOOK_EVERY_MS = 50
 local RESEND_MS = 700
-local CHANNELS = 5 -- that every board has
 
 local TABLE_KEY = 192
 assert(param:add_table(TABLE_KEY, "ARMC_", 2), "arm: no room for parameters")
@@ -36,7 +35,7 @@ mavlink:register_rx_msgid(COMMAND_ACK)
 mavlink:register_rx_msgid(HEARTBEAT)
 
 local job = nil     -- what is under way: order, argument, mission item's id, time of the last sending
-local heard = false -- the arm's heartbeat: before it, the autopilot would take our command for its own
+local heard = nil   -- channel of the arm's heartbeat: before it, the autopilot would take our command for its own
 
 local function say(severity, text)
   gcs:send_text(severity, "arm: " .. text)
@@ -47,12 +46,9 @@ local function send(order, argument, confirmation)
   local payload = string.pack("<fffffffHBBB", argument, 0, 0, 0, 0, 0, 0,
                               ORDERS[order], param:get("SYSID_THISMAV") or param:get("MAV_SYSID") or 1,
                               COMPONENT:get(), confirmation)
+  -- never on a channel that there may not be: ArduPilot 4.7-dev SITL ends in a segmentation fault
   local chosen = CHANNEL:get()
-  for channel = 0, CHANNELS - 1 do
-    if chosen < 0 or chosen == channel then
-      mavlink:send_chan(channel, COMMAND_LONG, payload)
-    end
-  end
+  mavlink:send_chan(chosen >= 0 and chosen or heard, COMMAND_LONG, payload)
 end
 
 local function finish(text, severity)
@@ -80,7 +76,7 @@ end
 
 local function receive()
   while true do
-    local message = mavlink:receive_chan()
+    local message, channel = mavlink:receive_chan()
     if not message then return end
     -- frame as the firmware keeps it: three bytes of its own, then MAVLink 2's length, two flags, sequence, system,
     -- component, and three bytes of id; then the payload
@@ -88,7 +84,7 @@ local function receive()
     local id = id_low + id_mid * 256 + id_high * 65536
     if component == COMPONENT:get() then
       if id == HEARTBEAT then
-        heard = true
+        heard = channel
       elseif id == COMMAND_ACK and job then
         local command, result = string.unpack("<HB", message, 13)
         if command == ORDERS[job.order] then

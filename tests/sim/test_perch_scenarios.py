@@ -183,6 +183,17 @@ def test_a_bar_ten_centimetres_out_of_reach_is_reported_and_the_vehicle_comes_ho
 
 
 @pytest.mark.scenario
+def test_on_a_position_that_wanders_as_on_satellites_the_move_is_made_though_the_mechanics_fail() -> None:
+    """As seen on both real flight stacks (docs/adr/0029): the arm that the daemon believes in has no equilibrium."""
+    result, verdict = fly(settings=("sim.position_wander_m=0.02",))
+    assert verdict.success, verdict.reason
+    assert any("no solution" in text for _, text in result.flight.texts)
+    pull = {move.name: move for move in verdict.moves}
+    assert pull["pull x"].error_m < pull["pull x, not compensated"].error_m
+    assert verdict.excursion_m < 0.3
+
+
+@pytest.mark.scenario
 def test_the_pilot_takes_the_vehicle_while_it_is_perched_and_the_arm_holds() -> None:
     def take(world: World) -> None:
         world.at(60.0, lambda w: w.autopilot.take_over("POSCTL"))

@@ -69,12 +69,16 @@ class Rig:
     companion: Tap
     recorder: MemoryRecorder
     daemon: Daemon | None
+    parts: list["asyncio.Task[None]"]
 
     async def until(self, condition: Callable[[], bool], timeout_s: float, otherwise: str) -> None:
-        """Wait for what must come."""
+        """Wait for what must come; a part that has ended, such as a flight stack that crashed, ends this too."""
         try:
             async with asyncio.timeout(timeout_s):
-                while not condition():  # noqa: ASYNC110 - the condition is the plant's and several parts' own
+                while not condition():
+                    for part in self.parts:
+                        if part.done():
+                            part.result()
                     await asyncio.sleep(0.05)
         except TimeoutError:
             said = [text.text for text in self.ground.texts[-5:]]
@@ -154,7 +158,7 @@ async def _rig(running: sitl.Sitl, stack: str, config: Config, *, daemon: bool) 
     tasks = [asyncio.create_task(part) for part in parts]
     failed = asyncio.create_task(asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION))
     try:
-        yield Rig(stack, config, world, link, tap, recorder, real)
+        yield Rig(stack, config, world, link, tap, recorder, real, tasks)
     finally:
         stop.set()
         failed.cancel()

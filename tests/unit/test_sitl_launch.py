@@ -23,6 +23,7 @@ from arm_companion.config import Config, load
 from arm_companion.errors import ConfigError, LinkError
 from arm_companion.sim import sitl, sitl_ardupilot
 from arm_companion.sim.ports import RigidState
+from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.sitl import Sitl, SitlFailed
 from arm_companion.sim.sitl_relay import Relay
 from arm_companion.sim.world import World
@@ -160,6 +161,14 @@ def test_one_that_ends_is_told_with_its_last_words(tmp_path: Path, config: Confi
         pytest.raises(SitlFailed, match=r"code 3(.|\n)*cannot find my parameters"),
     ):
         stack.due()
+
+
+def test_one_that_ends_in_flight_ends_the_flight_with_its_last_words_alone(tmp_path: Path, config: Config) -> None:
+    with (
+        started(tmp_path, ENDS, config) as stack,
+        pytest.raises(SitlFailed, match=r"code 3(.|\n)*cannot find my parameters"),
+    ):
+        run_simulated(fly_simulated(config, print, flown_by=stack))
 
 
 def test_one_that_ends_ends_the_watch(tmp_path: Path, config: Config) -> None:
