@@ -107,6 +107,13 @@ def _lost_contact(state: State) -> State:
     return _loose_wrap(state) if state.phase in (Phase.WRAP, Phase.CLOSE) else _slip(state)
 
 
+def _pulled_off(state: State) -> State:
+    """The same, and in a pull test the vehicle has been off its place for as long as positions are smoothed."""
+    state = _lost_contact(state)
+    x, y, z = PLACE
+    return dataclasses.replace(state, position=(x - 0.04, y, z)) if state.phase is Phase.VERIFY else state
+
+
 def _at_the_bottom(state: State) -> State:
     x, y, z = PLACE
     reference = Reference((x, y, z + DEEP))
@@ -160,7 +167,7 @@ PROVOCATIONS: dict[str, Provocation] = {
     "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
     "stiffness test failed": Provocation(
-        "no grip|closed around nothing|pull test failed", moved((-0.04, 0.0, 0.0)), _lost_contact
+        "no grip|closed around nothing|pull test failed", moved((-0.04, 0.0, 0.0)), _pulled_off
     ),
     "wrench over its limit": Provocation(
         "on the airframe",
