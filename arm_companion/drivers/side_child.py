@@ -28,10 +28,13 @@ def tell(kind: str, text: str) -> None:
 def run(body: Body, most_memory: int) -> None:
     """Serve until standard input ends or SIGTERM comes.
 
+    A terminal sends Ctrl-C to all processes at once. The daemon acts on it, and closes our input when it has said all.
+
     Args:
         body: what this process is for.
         most_memory: bytes of data that it may have.
     """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(OSError, ValueError):  # the unit's system calls may lack it
         resource.setrlimit(resource.RLIMIT_DATA, (most_memory, most_memory))
     with contextlib.suppress(OSError):
@@ -48,8 +51,7 @@ async def _main(body: Body) -> None:
             take(*json.loads(line))
 
     tasks = (asyncio.ensure_future(working), asyncio.create_task(read()))
-    for number in (signal.SIGTERM, signal.SIGINT):
-        asyncio.get_running_loop().add_signal_handler(number, tasks[0].cancel)
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, tasks[0].cancel)
     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
     for task in tasks:
         task.cancel()
