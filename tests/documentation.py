@@ -1,8 +1,11 @@
 """The commands of the documentation, and how the tests run each."""
 
+import importlib.util
 import re
 import shlex
+import sys
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
@@ -72,3 +75,14 @@ def words_of(line: str) -> list[str]:
     words = shlex.split(line, comments=True)
     ends = [i for i, word in enumerate(words) if word in {"|", ">", "&", "&&", ";", "2>"}]
     return words[: ends[0]] if ends else words
+
+
+def program(path: Path) -> ModuleType:
+    """An example program of the documentation as a module."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[path.stem] = module
+    spec.loader.exec_module(module)
+    return module

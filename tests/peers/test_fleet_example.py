@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-import importlib.util
 import json
 import os
 import shutil
@@ -18,6 +17,7 @@ import pytest
 
 from arm_companion.clock import ticks
 from arm_companion.config import load
+from tests.documentation import program
 from tests.mqtt_broker import Broker, serving
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "fleet" / "fleet.py"
@@ -25,13 +25,7 @@ SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "fleet" / "fleet.py"
 
 @pytest.fixture(scope="module")
 def fleet() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("fleet", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["fleet"] = module
-    spec.loader.exec_module(module)
-    return module
+    return program(SCRIPT)
 
 
 def test_a_vehicle_is_one_line_and_nonsense_changes_nothing(fleet: ModuleType) -> None:

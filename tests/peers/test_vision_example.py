@@ -1,6 +1,5 @@
 """The vision example: geometry of its targets, and what it sends to somebody who stands where the arm would."""
 
-import importlib.util
 import math
 import socket
 import subprocess
@@ -14,19 +13,14 @@ import pytest
 
 from arm_companion.drivers.targets import read_bar
 from arm_companion.protocol.dialect import mav
+from tests.documentation import program
 
 SCRIPT = Path(__file__).parents[2] / "docs" / "examples" / "vision" / "target_source.py"
 
 
 @pytest.fixture(scope="module")
 def vision() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("target_source", SCRIPT)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules["target_source"] = module
-    spec.loader.exec_module(module)
-    return module
+    return program(SCRIPT)
 
 
 def test_what_is_seen_ahead_of_a_vehicle_that_faces_east_is_in_the_east(vision: ModuleType) -> None:
