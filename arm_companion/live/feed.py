@@ -164,9 +164,8 @@ def _drawn(record: Record, cycle: Situation) -> dict[str, Any]:
 
 def _keep_out(cycle: Situation) -> dict[str, Any] | None:
     """The keep-out cone, body axes; None: there is none."""
-    cone = cycle.config.limits.keep_out
-    if not cone.half_angle_deg:
+    cone, mount = cycle.parameters.keep_out, cycle.mount
+    if cone is None:
         return None
-    away = math.hypot(*cone.apex_m)
-    axis = [-x / away for x in cone.apex_m]
-    return {"apex": cone.apex_m, "axis": axis, "half_angle": math.radians(cone.half_angle_deg)}
+    apex, axis = mount @ cone.apex, mount.rotation @ cone.axis
+    return {"apex": apex.tolist(), "axis": axis.tolist(), "half_angle": cone.half_angle}
