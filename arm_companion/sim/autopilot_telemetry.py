@@ -156,10 +156,7 @@ class Telemetry:
         return mav.MAVLink_extended_sys_state_message(mav.MAV_VTOL_STATE_UNDEFINED, self._modes.landed_state)
 
     def _attitude(self) -> Any:
-        w, x, y, z = self._estimate.attitude_wb
-        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-        return mav.MAVLink_attitude_message(self._boot_ms, roll, pitch, self._estimate.yaw, *self._estimate.rate_b)
+        return mav.MAVLink_attitude_message(self._boot_ms, *self._estimate.euler, *self._estimate.rate_b)
 
     def _attitude_quaternion(self) -> Any:
         e = self._estimate

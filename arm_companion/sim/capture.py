@@ -44,7 +44,7 @@ class Capture:
             return None
         self._since -= _PERIOD_S
         return mav.MAVLink_vision_position_estimate_message(
-            round(t * 1e6), *estimate.position_w, *_euler(estimate.attitude_wb), [math.nan] * 21
+            round(t * 1e6), *estimate.position_w, *estimate.euler, [math.nan] * 21
         )
 
 
@@ -96,13 +96,3 @@ class CaptureLine:
     def close(self) -> None:
         """Leave the port."""
         self._socket.close()
-
-
-def _euler(attitude_wb: tuple[float, float, float, float]) -> tuple[float, float, float]:
-    """Roll, pitch and yaw, rad."""
-    w, x, y, z = attitude_wb
-    return (
-        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
-        math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
-        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
-    )

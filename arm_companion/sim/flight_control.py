@@ -85,6 +85,14 @@ class Estimate:
     specific_force_b: Vec3 = (0.0, 0.0, -GRAVITY)  # m/s^2
 
     @property
+    def euler(self) -> Vec3:
+        """Roll, pitch and yaw, rad."""
+        w, x, y, z = self.attitude_wb
+        roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+        pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+        return roll, pitch, self.yaw
+
+    @property
     def yaw(self) -> float:
         """Heading, rad clockwise from north."""
         w, x, y, z = self.attitude_wb
