@@ -302,9 +302,7 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
 
 def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
     """The command-line contract of `sim --json`."""
-    from arm_companion.sim.verdict import HELD_SPANS  # noqa: PLC0415 - after the check for the extra
-
-    perched = next((w for w in verdict.wrench if w.span in HELD_SPANS), None)
+    held = verdict.held
     errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
     samples = result.flight.samples
     contract = {
@@ -312,9 +310,9 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "verdict": verdict.verdict,
         "reason": verdict.reason,
         "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
-        "wrench_rms_error_n": _number(perched.force_error_n if perched else math.nan),
-        "wrench_rms_n": _number(perched.true_force_n if perched else math.nan),
-        "wrench_two_sigma_share": _number(perched.covered if perched else math.nan),
+        "wrench_rms_error_n": _number(held.force_error_n if held else math.nan),
+        "wrench_rms_n": _number(held.true_force_n if held else math.nan),
+        "wrench_two_sigma_share": _number(held.covered if held else math.nan),
         "pose_error_with_m": _number(errors.get("pull x", math.nan)),
         "pose_error_without_m": _number(errors.get("pull x, not compensated", math.nan)),
         "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],

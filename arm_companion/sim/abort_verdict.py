@@ -55,7 +55,7 @@ def judge_aborts(flight: Flight, failure: str) -> AbortVerdict:
             reasons.append(f"the vehicle fell by {abort.sank_m:.2f} m after the abort in {abort.state}")
     reasons += after(flight, perched=True) + unharmed(flight)
     verdict = AbortVerdict(not reasons, "failed" if reasons else "let go", "; ".join(dict.fromkeys(reasons)))
-    verdict.states = [(name, end - start) for name, start, end in flight.spans()]
+    verdict.states = flight.durations()
     verdict.aborts = aborts
     return verdict
 

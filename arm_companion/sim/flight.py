@@ -75,6 +75,10 @@ class Flight:
         times = [t for t, _ in self.states[1:]] + [self.end]
         return [(name, start, end) for (start, name), end in zip(self.states, times, strict=True)]
 
+    def durations(self) -> list[tuple[str, float]]:
+        """Name and length, s, of every state passed."""
+        return [(name, end - start) for name, start, end in self.spans()]
+
     def within(self, start: float, end: float) -> list[Sample]:
         """The samples of a span of time."""
         first = bisect.bisect_left(self.samples, start, key=lambda s: s.t)

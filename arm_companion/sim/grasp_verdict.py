@@ -76,8 +76,7 @@ def judge_grasp(flight: Flight, failure: str, config: Config) -> GraspVerdict:
     reasons += _left_alone(flight) if carried else []
     reasons += after(flight, perched=bool(carried)) + unharmed(flight)
     verdict = GraspVerdict(not reasons, "failed" if reasons else "grasped", "; ".join(dict.fromkeys(reasons)))
-    spans = flight.spans()
-    verdict.states = [(name, end - start) for name, start, end in spans]
+    verdict.states = flight.durations()
     if carried:
         forces = [s.truth.contact_force_n for s in carried]
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))

@@ -34,7 +34,7 @@ def judge_hang(flight: Flight, failure: str, weight_n: float) -> Verdict:
     if (struck := next((s for s in flight.samples if s.truth.rotor_contact), None)) is not None:
         reasons.append(f"a propeller struck something at {struck.t - flight.samples[0].t:.1f} s")
     verdict = Verdict(not reasons, "hung" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
-    verdict.states = [(name, end - start) for name, start, end in flight.spans()]
+    verdict.states = flight.durations()
     if hung:
         forces = [s.truth.contact_force_n for s in hung]
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))

@@ -20,7 +20,6 @@ from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
 from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
-from arm_companion.sim.verdict import HELD_SPANS
 
 MODEL_ERROR = 0.1
 """Greatest relative difference between the plant and the controller's parameters."""
@@ -253,7 +252,7 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
     harm = [reason for reason in verdict.reason.split("; ") if any(word in reason for word in _HARM)]
     if most > _OVER * config.limits.tension_max_n:
         harm.append(f"a tendon carried {most:.1f} N")
-    covered = next((w.covered for w in verdict.wrench if w.span in HELD_SPANS), math.nan)
+    covered = verdict.held.covered if verdict.held else math.nan
     return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words, covered)
 
 

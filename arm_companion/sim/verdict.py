@@ -9,8 +9,7 @@ from itertools import pairwise
 from arm_companion.sim.flight import Flight, Mark, WrenchSeen
 from arm_companion.sim.world import Sample
 
-HELD_SPANS = ("perched", "hanging", "carried")
-"""Spans of `wrench_errors` in which the arm holds something."""
+_HELD_SPANS = ("perched", "hanging", "carried")
 
 _HELD_SHARE = 0.95
 _HELD_WRAP_RAD = 2.0
@@ -60,6 +59,11 @@ class Verdict:
     hover_error_m: float = math.nan  # RMS about the mean while perched and not moved
     excursion_m: float = math.nan  # greatest distance from where it was asked to be while the arm lets go
 
+    @property
+    def held(self) -> WrenchError | None:
+        """The prediction's error while the arm held something; None: it never did, or nothing valid was predicted."""
+        return next((error for error in self.wrench if error.span in _HELD_SPANS), None)
+
 
 def judge(flight: Flight, failure: str, *, leaning: bool = False) -> Verdict:
     """The verdict on a perch flight.
@@ -80,7 +84,7 @@ def judge(flight: Flight, failure: str, *, leaning: bool = False) -> Verdict:
     reasons += after(flight, perched=bool(perched))
     reasons += unharmed(flight, leaning=leaning)
     verdict = Verdict(not reasons, "perched" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
-    verdict.states = [(name, end - start) for name, start, end in spans]
+    verdict.states = flight.durations()
     if perched:
         forces = [s.truth.contact_force_n for s in perched]
         verdict.contact_force_n = (statistics.fmean(forces), max(forces))
