@@ -9,7 +9,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import PayloadReport, Vec3
 from arm_companion.mission.grasp import LIGHT_SHARE, low
 from arm_companion.mission.motion import ZERO, add, norm, scale, sub
-from arm_companion.mission.payload import Load, interrupted, watch_load, weigh
+from arm_companion.mission.payload import ROTOR_LAG_S, Load, interrupted, watch_load, weigh
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Anchor, Phase, State
 from arm_companion.values import replace
@@ -28,6 +28,7 @@ _UNTOUCHED = frozenset(
 )
 """Phases in which the rotors lift the vehicle alone."""
 
+_ARDUPILOT_LAG_S = 0.08  # of the 2 Hz low-pass between the thrust that ArduPilot tells and its motors
 _OPEN_SHARE = 0.5  # of the wrap, up to which the arm is still clear of the object
 _NEAR_GROUND_M = 0.1
 _SLOWLY = 0.3  # share of the speed there
@@ -53,7 +54,8 @@ def track_load(s: Situation) -> Load:
         lifted = 0.0
     elif state.phase is Phase.CARRY and state.load.settled and not state.load.light_s:
         lifted = state.load.mass  # whatever the rotors need more from now on is the battery's fault
-    load = watch_load(state.load, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt, lifted=lifted)
+    lag = ROTOR_LAG_S + (_ARDUPILOT_LAG_S if s.config.vehicle.autopilot == "ardupilot" else 0.0)
+    load = watch_load(state.load, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt, lifted=lifted, lag_s=lag)
     tightest = max(s.tensions, default=0.0)
     share = _LOOSE_LIGHT_SHARE if tightest < _LOOSE_SHARE * load.grip else LIGHT_SHARE
     # before it is weighed, what the test lift found at least

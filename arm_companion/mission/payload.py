@@ -13,7 +13,10 @@ the thrust then is beyond the weight of the vehicle m is load:
     (m + load) (g - dv/dt) = m (c (a + b (u - u_0)) + d v)                                    (carrying)
 
 The derivative is never taken: all signals pass the same low-pass filter, w' = p (v - w), which gives dv/dt as it is.
-What is asked of the rotors passes one that is slower by their own lag.
+What is asked of the rotors passes their own lag before it.
+
+Steepness and drag are learnt from manoeuvres alone. In a hover the autopilot answers the noise of its own estimate, and
+a curve that is fitted to those answers becomes flatter with every minute.
 """
 
 import math
@@ -27,8 +30,13 @@ from arm_companion.mission.facts import VehicleState
 from arm_companion.mission.motion import rotate
 from arm_companion.values import replace
 
+ROTOR_LAG_S = 0.04
+"""From the thrust that is told to the thrust, s: rotors of a foot take 30 ms, and it is told 50 times a second."""
+
 _POLE = 6.0  # rad/s, of the low-pass filter
-_ROTOR_LAG_S = 0.03  # from the thrust asked for to the thrust, as rotors of a foot have
+_MANOEUVRE = 0.3  # m/s^2, from which on steepness shows above the noise
+_FAST_M_PER_S = 0.5  # and drag
+_VIOLENT = 1.5  # m/s^2, beyond which the curve is no straight line
 _SPECTRUM = 1.5e-3  # m^2/s^3: an acceleration known to 0.05 m/s^2, with errors that last 0.3 s
 _DRIFT = 0.01  # m/s^2 per root second, of what the rotors lift at the same share
 _PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line through zero
@@ -58,11 +66,13 @@ class Flow:
         up: c, cosine of the tilt.
         push: u c, the upward part of the share of thrust.
         sink: v, speed downwards, m/s.
+        spun: c and u c after the rotors' lag alone; None: the same.
     """
 
     up: float
     push: float
     sink: float
+    spun: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -113,12 +123,17 @@ class ThrustCurve:
 
     def learn(self, flow: Flow, felt: float, dt: float) -> "ThrustCurve":
         """The curve after `dt` seconds in which the rotors lifted the vehicle's mass by `felt` = g - dv/dt, m/s^2."""
+        if abs(felt - GRAVITY) > _VIOLENT:
+            return self.forget(dt)
         h, before, P = self._regressor(flow), np.array(self.theta), np.array(self.covariance)
         P[0, 0] += _DRIFT**2 * dt
         Ph = P @ h
-        gain = Ph / (h @ Ph + _SPECTRUM / dt)
+        spread = h @ Ph + _SPECTRUM / dt
+        gain = Ph / spread
+        if abs(felt - GRAVITY) < _MANOEUVRE and abs(flow.sink) < _FAST_M_PER_S:
+            gain[1:] = 0.0  # Schmidt's filter: what is not learnt stays as uncertain as it is
         theta = before + gain * (felt - float(h @ before))
-        P -= gain[:, None] * Ph
+        P += spread * np.outer(gain, gain) - np.outer(gain, Ph) - np.outer(Ph, gain)
         return replace(self, theta=_three(theta), covariance=_rows(0.5 * (P + P.T)))
 
     def _regressor(self, flow: Flow) -> Array:
@@ -196,7 +211,9 @@ NO_LOAD = Load()
 """Before anything is known."""
 
 
-def watch_load(old: Load, vehicle: VehicleState, mass: float, dt: float, *, lifted: float | None) -> Load:
+def watch_load(
+    old: Load, vehicle: VehicleState, mass: float, dt: float, *, lifted: float | None, lag_s: float = ROTOR_LAG_S
+) -> Load:
     """The load after one cycle.
 
     Args:
@@ -205,6 +222,7 @@ def watch_load(old: Load, vehicle: VehicleState, mass: float, dt: float, *, lift
         mass: of the vehicle with its arm, kg.
         dt: s.
         lifted: what the rotors surely lift besides the vehicle, kg, so that they may be learnt from; None: not known.
+        lag_s: time constant from the thrust that is told to the thrust, s.
     """
     if dt <= 0.0:
         return old
@@ -215,10 +233,10 @@ def watch_load(old: Load, vehicle: VehicleState, mass: float, dt: float, *, lift
         curve = None if old.curve is None else old.curve.forget(dt)
         return replace(interrupted(old), curve=curve, grounded=grounded)
     new = Flow(up, up * vehicle.thrust, vehicle.velocity_w[2])
-    flow, seen_s, curve = _filtered(old.flow or new, new, dt), old.seen_s + dt, old.curve
+    flow, seen_s, curve = _filtered(old.flow or new, new, dt, lag_s), old.seen_s + dt, old.curve
     if seen_s < _SETTLE_S:
         return replace(old, flow=flow, seen_s=seen_s, now=math.nan, grounded=False)
-    felt = GRAVITY - _POLE * (new.sink - flow.sink)
+    felt = GRAVITY - math.expm1(_POLE * dt) / dt * (new.sink - flow.sink)  # of samples, exactly
     if lifted is not None:
         curve = (curve or ThrustCurve.prior(flow.push / flow.up)).learn(flow, felt * (1.0 + lifted / mass), dt)
     elif curve is not None:
@@ -241,12 +259,15 @@ def weigh(old: Load, dt: float) -> Load:
     return replace(old, mass=mass, spread=old.curve.sigma(old.flow), weighed_s=total)
 
 
-def _filtered(old: Flow, new: Flow, dt: float) -> Flow:
-    rotors, body = math.exp(-dt / (1.0 / _POLE + _ROTOR_LAG_S)), math.exp(-_POLE * dt)
+def _filtered(old: Flow, new: Flow, dt: float, lag_s: float) -> Flow:
+    rotors, body = math.exp(-dt / lag_s), math.exp(-_POLE * dt)
+    before = old.spun or (old.up, old.push)
+    up, push = new.up + rotors * (before[0] - new.up), new.push + rotors * (before[1] - new.push)
     return Flow(
-        new.up + rotors * (old.up - new.up),
-        new.push + rotors * (old.push - new.push),
+        up + body * (old.up - up),
+        push + body * (old.push - push),
         new.sink + body * (old.sink - new.sink),
+        (up, push),
     )
 
 

@@ -3,7 +3,8 @@
 A set-point moves a path of the controller's own (`AC_PosControl::input_pos_vel_accel`): the path is bent towards the
 set-point with bounded acceleration and jerk, and the vehicle is held on the path by a PID with the path's own
 acceleration fed forward. So an acceleration that is commanded for long, at a position that stays, becomes no force: it
-moves the end of the path by a / (k_a k_v). Down, an inner loop follows the measured acceleration.
+moves the end of the path by a / (k_a k_v). Down, an inner loop follows the measured acceleration, and what it asks for
+is smoothed on its way to the motors; ATTITUDE_TARGET tells it before that.
 
 Gains are ArduPilot copter's defaults (4.7), in SI; structure and equations are those of AC_PosControl, AC_PID_2D and
 AP_Math's control.cpp.
@@ -50,6 +51,7 @@ _ERROR_CUTOFF_HZ = 5.0  # PSC_VELXY_FLTE and _FLTD
 _THRUST_PER_ACCELERATION = 0.1  # PSC_ACCZ_P over the hover throttle of 0.5: share of hover thrust for 1 m/s^2
 _THRUST_INTEGRAL = 0.2  # 1/s, PSC_ACCZ_I over the same
 _ACCELERATION_CUTOFF_HZ = 20.0  # PSC_ACCZ_FLTE
+_THROTTLE_CUTOFF_HZ = 2.0  # POSCONTROL_THROTTLE_CUTOFF_FREQ_HZ, a constant
 
 
 @dataclass(slots=True)
@@ -108,6 +110,7 @@ class _Vertical:
 class _Loops:
     paths: list[_Path] = field(default_factory=list)
     vertical: _Vertical = field(default_factory=_Vertical)
+    throttle: float | None = None  # share of hover thrust, smoothed
 
 
 class ArdupilotController(FlightController):
@@ -143,6 +146,12 @@ class ArdupilotController(FlightController):
             wanted[i] = path.acceleration + path.correct(target - estimate.velocity_w[i], gains, dt)
         wanted[2] = loops.vertical.thrust(wanted[2], _sinking(estimate), dt)
         return wanted, [0.0, 0.0, 0.0]
+
+    def _smoothed(self, thrust: float, dt: float) -> float:
+        loops = self._loops
+        last = thrust if loops.throttle is None else loops.throttle
+        loops.throttle = last + _share(_THROTTLE_CUTOFF_HZ, dt) * (thrust - last)
+        return loops.throttle
 
 
 def square_root_control(error: float, gain: float, accelerate: float) -> float:

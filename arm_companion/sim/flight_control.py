@@ -187,9 +187,14 @@ class FlightController:
         down, thrust, produced = self._attitude_and_thrust(acceleration, release)
         self._wind_up(acceleration, velocity_error, produced, thrust, dt)
         rate = self._attitude(estimate, down, setpoint)
-        torque = self._mix(thrust, self._rates(estimate.rate_b, rate, dt))
         self.thrust = thrust
+        thrust = self._smoothed(thrust, dt)
+        torque = self._mix(thrust, self._rates(estimate.rate_b, rate, dt))
         return self._spin(thrust * self.airframe.mass * GRAVITY, torque, dt)
+
+    def _smoothed(self, thrust: float, dt: float) -> float:  # noqa: ARG002 - for flight stacks that smooth
+        """What the rotors are told of a thrust that is asked for, both shares of hover thrust."""
+        return thrust
 
     def _translation(
         self, estimate: Estimate, setpoint: MotionSetpoint, dt: float, climb: float

@@ -108,3 +108,25 @@ def test_square_root_control_is_a_line_near_and_brakes_far() -> None:
     assert square_root_control(near * (1 - 1e-9), 1.0, 1.0) == pytest.approx(
         square_root_control(near * (1 + 1e-9), 1.0, 1.0)
     )
+
+
+def test_what_it_asks_for_reaches_the_motors_smoothed_and_is_told_before() -> None:
+    """2 Hz, a constant of AC_PosControl: two thirds of a step after 80 ms."""
+    body = RigidBody(position=np.array(HOME))
+    controller = ArdupilotController(Airframe(MASS, motor_lag=1e-4))
+    for _ in range(500):
+        fly(controller, body, MotionSetpoint(HOME, STILL, STILL, 0.0))
+    asked, made = [], []
+    for _ in range(100):
+        up = (HOME[0], HOME[1], HOME[2] - 5.0)
+        s = body.state()
+        estimate = Estimate(s.position_w, s.velocity_w, s.attitude_wb, s.rate_b, s.specific_force_b)
+        rotors = controller.update(estimate, MotionSetpoint(up, (0.0, 0.0, -1.0), STILL, 0.0), DT)
+        asked.append(controller.thrust)
+        made.append(rotors.thrust_n / (MASS * 9.80665))
+        body.step(rotors, DT)
+    assert max(asked) > 1.05
+    smooth = made[0]
+    for told, pushed in zip(asked[1:], made[1:], strict=True):
+        smooth += (1.0 - math.exp(-DT / 0.08)) * (told - smooth)
+        assert pushed == pytest.approx(smooth, abs=0.01)
