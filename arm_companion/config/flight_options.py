@@ -100,6 +100,9 @@ class PerchConfig:
     verify_give_share: float = option(
         "share of that offset which a good grip gives at most", 0.3, lower=0.05, upper=0.95
     )
+    attempts: int = option(
+        "approaches of one PERCH or GRASP that finds nothing, or whose grip does not hold", 2, lower=1, upper=5
+    )
     slide_force_n: float = option(
         "most that a vertical move pushes against a wrap, which slides on its bar rather than stretch; 0 does not push",
         1.5,

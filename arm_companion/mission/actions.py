@@ -98,6 +98,7 @@ def _prepare(s: Situation) -> State:
                 rest=None,
                 offset=ZERO,
                 reference=state.reference or _here(s),
+                tries=state.tries + 1,
             )
         case Phase.REACH:
             return replace(state, force=replace(state.force, tared_s=0.0, above_s=0.0))

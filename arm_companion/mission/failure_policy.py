@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import grasp, hang, hazards, perch
+from arm_companion.mission import grasp, hang, hazards, perch, pull_test
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -129,7 +129,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "contact lost",
         ArmFault.CONTACT_LOST,
-        (perch.no_grip, grasp.not_closed, perch.pull_test_failed, hazards.grip_lost, hang.slips, grasp.dropped),
+        (perch.no_grip, grasp.not_closed, pull_test.pull_test_failed, hazards.grip_lost, hang.slips, grasp.dropped),
         "cannot be told from letting go; a free arm has none",
     ),
     Cause(
@@ -143,7 +143,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "stiffness test failed",
         ArmFault.GRIP_TEST_FAILED,
-        (perch.pull_test_failed, perch.no_grip, grasp.lift_failed, grasp.not_closed),
+        (pull_test.pull_test_failed, perch.no_grip, grasp.lift_failed, grasp.not_closed),
         "does not apply",
     ),
     Cause(
@@ -184,7 +184,12 @@ CAUSES: tuple[Cause, ...] = (
         "does not apply: every start begins in STARTUP, and nothing moves until told",
     ),
     Cause("recorder's disk full", ArmFault.NONE, (), "nothing: counted, the record has a gap"),
-    Cause("MQTT broker gone", ArmFault.NONE, (), "nothing: this version has no MQTT"),
+    Cause(
+        "MQTT broker gone",
+        ArmFault.NONE,
+        (),
+        "nothing: it serves people alone, and connects again by itself",
+    ),
     Cause(
         "configuration changed in flight",
         ArmFault.NONE,
@@ -246,6 +251,8 @@ the two differ.
   command that is running is answered with FAILED.
 - "told" is one STATUSTEXT in a state, and changes nothing.
 - (a) is the column "anywhere else".
+- A try that finds no contact or no grip is followed by another, up to `perch.attempts`; what stands here for it is what
+  the last one does.
 - The pilot always wins: set-points stop in the cycle in which another mode is seen, in every state.
 - A grip that is tested is given up only by a person, by a limit that breaks (tension, wrench), or when it slips: a
   vehicle that hangs on an arm with a dead servo is better off than one that falls.

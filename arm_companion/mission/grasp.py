@@ -20,6 +20,7 @@ from arm_companion.mission.motion import arrived, norm
 from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import CARRYING, Phase
+from arm_companion.mission.tries import or_fail
 
 Row = Transition[Phase, Situation]
 Ask = OrderRow[Phase, Situation]
@@ -190,7 +191,7 @@ ABORTS: tuple[Row, ...] = (
 
 PROGRESS: tuple[Row, ...] = (
     Row(frozenset({Phase.CLOSE}), closed, Phase.VERIFY, "closed"),
-    Row(frozenset({Phase.CLOSE}), not_closed, Phase.UNLOAD, "not closed", ArmFault.GRIP_TEST_FAILED),
+    *or_fail(Phase.CLOSE, not_closed, Phase.UNLOAD, "not closed", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.VERIFY}), lift_failed, Phase.UNLOAD, "test lift failed", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.VERIFY}), lift_passed, Phase.LIFT, "test lift passed"),
     Row(frozenset({Phase.LIFT}), lifted, Phase.CARRY, "lifted"),

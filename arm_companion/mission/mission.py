@@ -25,6 +25,7 @@ from arm_companion.mission.sharing import keep_sharing
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
+from arm_companion.mission.tries import given_up
 from arm_companion.mission.vigil import keep_vigil
 from arm_companion.mission.wrench import predict
 from arm_companion.values import replace
@@ -157,9 +158,9 @@ def _settle(state: State, request: Request) -> State:
         case Order.READY:
             return replace(state, streaming=True, errors=ArmFault.NONE)
         case Order.PERCH:
-            return replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request))
+            return replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request), tries=0)
         case Order.GRASP:
-            return replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR)
+            return replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR, tries=0)
         case Order.CLEAR_ERRORS:  # a person has looked at the tendons
             return replace(state, errors=ArmFault.NONE, watch=())
         case Order.FEEDFORWARD:
@@ -203,7 +204,7 @@ def _move_on(s: Situation, answers: list[Answer], notices: list[Notice]) -> Situ
     running = s.state.running
     if running is None:
         return s
-    if row.fails:
+    if row.fails or given_up(running, s.state.phase):
         answers.append(Answer(running.request, Result.FAILED, reason))
     elif s.state.phase in running.done:
         answers.append(Answer(running.request, Result.ACCEPTED, progress=100))

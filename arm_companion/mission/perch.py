@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import grasp, hang
+from arm_companion.mission import grasp, hang, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -26,7 +26,8 @@ from arm_companion.mission.hazards import (
     wrench_over_limit,
 )
 from arm_companion.mission.machine import OrderRow, Table, Transition
-from arm_companion.mission.motion import ZERO, arrived, dot, norm, scale, sub
+from arm_companion.mission.motion import ZERO, arrived, norm
+from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, tested_to_hang
 from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import CARRYING, PerchKind, Phase
@@ -47,7 +48,6 @@ _SETTLE_S = 1.0
 _AT_LIMIT_RAD = 1e-6
 _CONTACT_SETTLE_S = 2.5
 _AT_BAR_M = 0.03
-_PROBE_S = 3.0
 _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
 _CLEAR_BEND_RAD = 0.25
@@ -85,14 +85,6 @@ def no_grip(s: Situation) -> str | None:
     if gripped(s) is not None or not wrapped_to_the_limit(s):
         return None
     return f"no grip: {max(s.state.tension):.1f} N at full wrap, {s.grip_needed:.1f} N are needed"
-
-
-def pull_test_failed(s: Situation) -> str | None:
-    """The pull test moved the vehicle as if nothing held it."""
-    share = pull_test_share(s)
-    if s.grasping or s.elapsed < _PROBE_S or share < s.config.perch.verify_give_share:
-        return None
-    return f"pull test failed: gave {share:.0%} of the asked move"
 
 
 # --- guards: what goes well ---
@@ -142,6 +134,15 @@ def at_standoff(s: Situation) -> str | None:
     return "at the stand-off" if ok else None
 
 
+def ready_to_try_again(s: Situation) -> str | None:
+    """Back at the stand-off after a try that came to nothing, the order still open, and nothing against another."""
+    if not tries.setting_out(s) or at_standoff(s) is None:
+        return None
+    grasping = s.grasping
+    against = grasp.cannot_grasp(s) if grasping else cannot_perch(s)
+    return "at the stand-off for another try" if against is None else None
+
+
 def contact_found(s: Situation) -> str | None:
     """Something pushes the vehicle back, and goes on doing so, that the free arm does not explain."""
     if s.state.force.above_s < _CONTACT_PERSISTS_S:
@@ -171,28 +172,6 @@ def gripped(s: Situation) -> str | None:
     """Some tendon carries the grip tension with the wrap complete."""
     most = max(s.state.tension)
     return f"gripped with {most:.1f} N" if s.at_bend_goal and most >= s.grip_needed else None
-
-
-def pull_test_share(s: Situation) -> float:
-    """Share of the asked move that the pull test's vehicle made, away from the bar.
-
-    Both places are smoothed: an estimator's noise of 4 mm is 8 % of the move, and the limit is 30 %.
-    """
-    back = scale(s.ahead, -1.0)
-    return dot(sub(s.state.position, s.probe), back) / s.config.perch.verify_pull_m
-
-
-def pull_test_passed(s: Situation) -> str | None:
-    """The grip gave less than the allowed share."""
-    share = pull_test_share(s)
-    if s.grasping or s.elapsed < _PROBE_S or share >= s.config.perch.verify_give_share:
-        return None
-    return f"pull test passed: gave {share:.0%} of the asked move"
-
-
-def tested_to_hang(s: Situation) -> str | None:
-    """The grip is good, and the vehicle shall hang by it."""
-    return pull_test_passed(s) if s.state.kind is PerchKind.HANG else None
 
 
 def unloaded(s: Situation) -> str | None:
@@ -259,7 +238,7 @@ ORDERS: tuple[Ask, ...] = (
     Ask(Order.JOG, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY})),
     Ask(Order.RELEASE, GRASPING | GRIPPED, Phase.UNLOAD, STOWED_ONLY),
     Ask(Order.RELEASE, frozenset({Phase.HOLDING}), Phase.RELEASE, STOWED_ONLY, hang.cannot_open),
-    Ask(Order.STOW, FREE_FLIGHT, Phase.DEPART, STOWED_ONLY),
+    Ask(Order.STOW, FREE_FLIGHT | {Phase.DEPART}, Phase.DEPART, STOWED_ONLY),
     Ask(Order.STOW, frozenset({Phase.READYING, Phase.READY, Phase.STOWING}), Phase.STOWING, STOWED_ONLY),
     Ask(Order.STOW, STOWED_ONLY, Phase.STOWED, STOWED_ONLY),
     Ask(Order.ABORT, FREE_FLIGHT, Phase.DEPART, frozenset({Phase.DEPART})),
@@ -368,22 +347,17 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.READYING}), pose_checked, Phase.READY, "pose checked"),
         Row(frozenset({Phase.APPROACH}), at_standoff, Phase.REACH, "at stand-off"),
         Row(frozenset({Phase.REACH}), contact_found, Phase.CONTACT, "contact found"),
-        Row(frozenset({Phase.REACH}), no_contact, Phase.DEPART, "no contact", ArmFault.NO_CONTACT),
+        *tries.or_fail(Phase.REACH, no_contact, Phase.DEPART, "no contact", ArmFault.NO_CONTACT),
         Row(frozenset({Phase.CONTACT}), settled_at_object, Phase.CLOSE, "settled at the object"),
         Row(frozenset({Phase.CONTACT}), contact_settled, Phase.WRAP, "settled"),
         Row(frozenset({Phase.WRAP}), gripped, Phase.VERIFY, "grip tension"),
-        Row(frozenset({Phase.WRAP}), no_grip, Phase.UNLOAD, "no grip", ArmFault.GRIP_TEST_FAILED),
+        *tries.or_fail(Phase.WRAP, no_grip, Phase.UNLOAD, "no grip", ArmFault.GRIP_TEST_FAILED),
         Row(frozenset({Phase.VERIFY}), pull_test_passed, Phase.PERCHED, "pull test passed"),
-        Row(
-            frozenset({Phase.VERIFY}),
-            pull_test_failed,
-            Phase.UNLOAD,
-            "pull test failed",
-            ArmFault.GRIP_TEST_FAILED,
-        ),
+        *tries.or_fail(Phase.VERIFY, pull_test_failed, Phase.UNLOAD, "pull test failed", ArmFault.GRIP_TEST_FAILED),
         Row(frozenset({Phase.UNLOAD}), unloaded, Phase.RELEASE, "unloaded"),
         Row(frozenset({Phase.RELEASE}), cannot_depart, Phase.STOWING, "vehicle not ours"),
         Row(frozenset({Phase.RELEASE}), unwrapped, Phase.DEPART, "arm clear"),
+        Row(frozenset({Phase.DEPART}), ready_to_try_again, Phase.APPROACH, "another try"),
         Row(frozenset({Phase.DEPART}), at_standoff, Phase.STOWING, "at stand-off"),
         Row(frozenset({Phase.STOWING}), pose_checked, Phase.STOWED, "arm straight"),
         # time limits last: progress in the same cycle wins

@@ -186,6 +186,7 @@ class State:
     t: float = 0.0  # loop time of the previous step
     running: Running | None = None
     task: Order = Order.PERCH  # what the arm reaches out for: PERCH or GRASP
+    tries: int = 0  # approaches since it was ordered
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
     armed: bool = False  # of the previous step, to see the motors stop
     streaming: bool = False  # set-points go out
