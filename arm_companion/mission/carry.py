@@ -139,7 +139,9 @@ def push(s: Situation) -> Vec3:
         mass = load.mass if load.known and s.state.phase in CARRYING else 0.0
     else:
         mass = min(max(load.now, 0.0), load.mass if load.known and s.state.phase is Phase.PLACE else grasp.mass_max_kg)
-    gain = 1.0 if load.curve is None else load.curve.gain
+    # ArduPilot follows the acceleration that it measures, and so makes what is asked on any curve
+    curve = None if s.config.vehicle.autopilot == "ardupilot" else load.curve
+    gain = 1.0 if curve is None else curve.gain
     return (0.0, 0.0, -mass * GRAVITY / s.config.vehicle.mass_kg / gain)
 
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import ArmFault, Commands, Control, Facts, GraspTarget, Order, Result, WrenchSource
 from arm_companion.mission.motion import Reference, norm
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
@@ -66,6 +67,22 @@ def aloft(hovering: Hovering, kilograms: float = MASS, up: float = HEIGHT) -> Fa
 def hovered(phase: Phase, **fields: object) -> State:
     """Memory of a vehicle whose hover is known."""
     return memory(phase, load=Load(_known(), _flow(HOVER), 5.0, 0.0), **fields)
+
+
+@pytest.mark.parametrize(("autopilot", "curved"), [("px4", True), ("ardupilot", False)])
+def test_the_push_that_holds_a_load_up_counts_the_rotors_curve_where_the_autopilot_does_not(
+    autopilot: str, *, curved: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """PX4 takes thrust for proportional; ArduPilot follows the acceleration that it measures."""
+    config = parameters.config
+    flown = dataclasses.replace(config, vehicle=dataclasses.replace(config.vehicle, autopilot=autopilot))
+    run = Run(carrying(Phase.CARRY), dataclasses.replace(parameters, config=flown))
+    run.cycles(aloft(hovering), 3.0)
+    straight = -MASS * GRAVITY / config.vehicle.mass_kg
+    curve = run.state.load.curve
+    assert curve is not None
+    assert curve.gain > 1.1
+    assert run.state.lean[2] == pytest.approx(straight / curve.gain if curved else straight, rel=1e-6)
 
 
 # --- setting out ---
