@@ -109,17 +109,26 @@ def _tuple_writer(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
     return lambda value: [write(item) for write, item in zip(writers, value, strict=True)]
 
 
+def _summer(numbers: tuple[str, ...]) -> Callable[[Any], float]:
+    """What adds up these fields of a value: not finite if one of them is not."""
+    if not numbers:
+        return lambda _: 0.0
+    if len(numbers) == 1:
+        return operator.attrgetter(*numbers)
+    get = operator.attrgetter(*numbers)
+    return lambda value: sum(get(value))
+
+
 def _record_writer(cls: Any) -> Callable[[Any], Any]:
     """Much of a record is the very object of the cycle before, so what it became last is kept.
 
-    This runs for all of a record in every cycle: fields are taken together, and only those that JSON does not know
-    are looked at one by one.
+    This runs for all of a record in every cycle: its fields are copied as they are, and only those that JSON does not
+    know are looked at one by one.
     """
     kinds = fields(cls)
-    names = tuple(kinds)
-    get = operator.attrgetter(*names) if len(names) > 1 else lambda value: (getattr(value, names[0]),)
+    left_out = tuple(f.name for f in dataclasses.fields(cls) if f.name not in kinds)
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
-    get_numbers = operator.attrgetter(*numbers) if len(numbers) > 1 else None
+    sum_up = _summer(numbers)
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _writer(hint)) != _same]
     last: tuple[Any, Any] = (None, None)
 
@@ -127,15 +136,13 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
         nonlocal last
         seen, table = last
         if value is not seen:
-            table = dict(zip(names, get(value), strict=True))
+            table = value.__dict__.copy()
+            for name in left_out:
+                del table[name]
             for name, write_field in others:
                 table[name] = write_field(table[name])
-            if get_numbers is not None:
-                total = sum(get_numbers(value))
-                finite = total - total == 0.0  # of most records, and then none of its numbers is looked at
-            else:
-                finite = False
-            if not finite:
+            total = sum_up(value)
+            if total - total != 0.0:  # of few records, and then its numbers are looked at
                 for name in numbers:
                     table[name] = _number(table[name])
             last = (value, table)
