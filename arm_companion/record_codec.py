@@ -195,16 +195,17 @@ def _record_builder(cls: Any) -> Callable[[Any], Any]:
     names = kinds.keys()
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _builder(hint)) != _same]
-    every = dataclasses.fields(cls)
-    defaults = {f.name: f.default for f in every if f.default is not dataclasses.MISSING}
+    # in the order of the class, in which they are written again
+    every: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(cls)}
+    needed = {name for name, default in every.items() if default is dataclasses.MISSING}
     bare = not hasattr(cls, "__slots__") and not hasattr(cls, "__post_init__")
 
     def make(table: dict[str, Any]) -> Any:
         if not table.keys() <= names:
             raise KeyError(*(table.keys() - names))
-        value = defaults | table
-        if len(value) != len(every):
-            raise KeyError(*(f.name for f in every if f.name not in value))
+        if not needed <= table.keys():
+            raise KeyError(*(needed - table.keys()))
+        value = every | table
         for name in numbers:
             if type(value[name]) is not float:
                 value[name] = float(value[name])

@@ -92,6 +92,13 @@ def test_every_float_comes_back_with_every_bit(a: float, b: float) -> None:
         assert (math.isnan(x) and math.isnan(y)) or (x == y and math.copysign(1, x) == math.copysign(1, y))
 
 
+def test_what_was_read_is_written_again_byte_for_byte() -> None:
+    """Memory that is taken up from a record is compared as text (record/shares.py)."""
+    for cycle in itertools.islice(cycles(Reader(GOLDEN)), 300):
+        if isinstance(cycle, Cycle):
+            assert dumps(loads(State, cycle.state)).encode() == cycle.state
+
+
 def test_the_stock_reader_finds_every_channel_with_a_schema_that_fits(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     write(path)
