@@ -60,14 +60,18 @@ class KeepOut:
         Args:
             bend: of the arm without load.
         """
-        from_apex = _arc(bend, self.length) - self.apex
+        return float(self.distance(_arc(bend, self.length)).min()) - self.radius
+
+    def distance(self, points: Array) -> Array:
+        """Distance (...) in m of points (..., 3), base axes, from the cone's surface; negative inside."""
+        from_apex = points - self.apex
         along = from_apex @ self.axis
-        across = np.sqrt(np.maximum((from_apex**2).sum(axis=1) - along**2, 0.0))
+        across = np.sqrt(np.maximum((from_apex**2).sum(axis=-1) - along**2, 0.0))
         cosine, sine = math.cos(self.half_angle), math.sin(self.half_angle)
         nearest = across * cosine - along * sine
         before_apex = across * sine + along * cosine < 0.0  # nothing of the cone is nearer than its apex
-        distance = np.where(before_apex, np.hypot(across, along), nearest)
-        return float(distance.min()) - self.radius
+        distance: Array = np.where(before_apex, np.hypot(across, along), nearest)
+        return distance
 
     def admits(self, bend: Array, next_bend: Array) -> bool:
         """Whether the arm may go on from one bend (2,) to the next: outside the cone, or at least not deeper in it."""
@@ -77,13 +81,15 @@ class KeepOut:
     def least_on_way(self, bend: Array, goal: Array) -> float:
         """Least clearance, m, on the straight way in bends from one (2,) to another."""
         steps = max(math.ceil(float(np.linalg.norm(goal - bend)) / _STEP_RAD), 1)
-        return min(self.clearance(bend + k / steps * (goal - bend)) for k in range(steps + 1))
+        bends = bend + np.arange(steps + 1)[:, None] / steps * (goal - bend)
+        return float(self.distance(_arc(bends, self.length)).min()) - self.radius
 
 
 def _arc(bend: Array, length: float) -> Array:
-    """Points (k, 3) of an arc, base axes; `arm.arc.tip_position` for many sections at once."""
-    angles = _NODES[:, None] * bend
-    theta = np.sqrt((angles**2).sum(axis=1, keepdims=True))
+    """Points (..., k, 3) of arcs with bends (..., 2), base axes; `arm.arc.tip_position` for many sections at once."""
+    angles = _NODES[:, None] * bend[..., None, :]
+    theta = np.sqrt((angles**2).sum(axis=-1, keepdims=True))
     aside = 0.5 * angles * np.sinc(theta / (2.0 * math.pi)) ** 2
-    points: Array = length * _NODES[:, None] * np.hstack((aside, np.sinc(theta / math.pi)))
+    along = np.sinc(theta / math.pi)
+    points: Array = length * _NODES[:, None] * np.concatenate((aside, along), axis=-1)
     return points

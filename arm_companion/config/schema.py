@@ -31,6 +31,7 @@ from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfi
 from arm_companion.config.mqtt_options import MqttConfig
 from arm_companion.config.options import section
 from arm_companion.config.page_options import PageConfig
+from arm_companion.config.reach_options import ReachConfig
 from arm_companion.config.servo_options import CalibrationConfig, ServosConfig
 from arm_companion.errors import ConfigError
 
@@ -53,6 +54,7 @@ __all__ = [
     "PageConfig",
     "PerchConfig",
     "RatesConfig",
+    "ReachConfig",
     "RecordConfig",
     "SegmentConfig",
     "ServosConfig",
@@ -81,6 +83,7 @@ class Config:
     perch: PerchConfig = section(PerchConfig)
     hang: HangConfig = section(HangConfig)
     grasp: GraspConfig = section(GraspConfig)
+    reach: ReachConfig = section(ReachConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)

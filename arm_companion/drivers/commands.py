@@ -70,6 +70,8 @@ _BEND: Final = (
     Parameter(3, "delta", -2.0 * math.pi, 2.0 * math.pi),
 )
 _OFFSET: Final = tuple(Parameter(i, axis, -1.0, 1.0) for i, axis in ((2, "x"), (3, "y"), (4, "z")))
+_REACH_KIND: Final = Parameter(1, "kind", 0, 1, whole=True)
+_POINT: Final = tuple(Parameter(i, axis, -10_000.0, 10_000.0) for i, axis in ((2, "north"), (3, "east"), (4, "down")))
 _TIP: Final = tuple(Parameter(i, axis, -10.0, 10.0) for i, axis in ((2, "x"), (3, "y"), (4, "z")))
 
 _NAMES: Final = {
@@ -80,6 +82,7 @@ _NAMES: Final = {
     mav.MAV_CMD_ARM_RELEASE: "RELEASE",
     mav.MAV_CMD_ARM_ABORT: "ABORT",
     mav.MAV_CMD_ARM_JOG: "JOG",
+    mav.MAV_CMD_ARM_REACH: "REACH",
     mav.MAV_CMD_ARM_CALIBRATE: "CALIBRATE",
     mav.MAV_CMD_ARM_CLEAR_ERRORS: "CLEAR_ERRORS",
     mav.MAV_CMD_ARM_FEEDFORWARD: "FEEDFORWARD",
@@ -142,6 +145,8 @@ def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
             if kind == JOG_BEND:
                 return (kind, *(p.read(command) for p in _BEND))
             return (kind, *(p.read(command) for p in (_OFFSET if kind == JOG_VEHICLE else _TIP)))
+        case "REACH":
+            return (_REACH_KIND.read(command), *(p.read(command) for p in _POINT))
         case "CALIBRATE":
             return (_CALIBRATION_STEP.read(command),)
         case "FEEDFORWARD":

@@ -67,21 +67,24 @@ class PathFeedforward:
         """The set-point with its acceleration turned into a path.
 
         Args:
-            setpoint: its acceleration is what the thrust shall make beyond that of hovering, m/s^2.
+            setpoint: its acceleration is what the thrust shall make beyond that of hovering, m/s^2; what of it belongs
+                to position and velocity is a path already.
             now: loop time, s; set-points that come later than 0.1 s after the last begin anew.
         """
         if self._last is not None and now - self._last > _LONGEST_STEP_S:
             self.reset()
         dt = 0.0 if self._last is None else now - self._last
         self._last = now
-        for axis, u, coefficients in zip(self._axes, setpoint.acceleration_w, (_LEVEL, _LEVEL, _DOWN), strict=True):
+        # of a path that is flown anyway, the acceleration is what ArduPilot takes it for
+        forces = [a - b for a, b in zip(setpoint.acceleration_w, setpoint.path_w, strict=True)]
+        for axis, u, coefficients in zip(self._axes, forces, (_LEVEL, _LEVEL, _DOWN), strict=True):
             axis.step(u, coefficients, dt)
         if all(abs(a.place) + abs(a.speed) + abs(a.acceleration) < _NOTHING for a in self._axes):
-            return Setpoint(setpoint.position_w, setpoint.velocity_w, (0.0, 0.0, 0.0), setpoint.yaw)
+            return Setpoint(setpoint.position_w, setpoint.velocity_w, setpoint.path_w, setpoint.yaw)
         return Setpoint(
             _sum(setpoint.position_w, [axis.place for axis in self._axes]),
             _sum(setpoint.velocity_w, [axis.speed for axis in self._axes]),
-            _sum((0.0, 0.0, 0.0), [axis.acceleration for axis in self._axes]),
+            _sum(setpoint.path_w, [axis.acceleration for axis in self._axes]),
             setpoint.yaw,
         )
 

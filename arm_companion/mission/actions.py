@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from arm_companion.mission import carry
+from arm_companion.mission import carry, reaching
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
@@ -23,7 +23,7 @@ from arm_companion.mission.motion import (
 )
 from arm_companion.mission.sharing import SHARING, SUSPENDED, begin, hung_reference, share_on, unloading
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, PerchKind, Phase, State
+from arm_companion.mission.state import CARRYING, TIP, PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
 from arm_companion.values import replace
 
@@ -131,7 +131,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     """
     settled = carry.settle(s) if s.grasping else replace(s.state, rest=_rest(s), sharing=share_on(s))
     s = s.remembering(settled)
-    state = replace(s.state, reference=_reference(s), lean=_lean(s))
+    state = reaching.move(s) if s.state.phase in TIP else replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
     if _tight_enough(s):
@@ -206,11 +206,14 @@ def setpoint(s: Situation) -> Setpoint | None:
     reference = s.state.reference
     if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
-    return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw)
+    path = s.state.lean if s.state.phase in TIP else ZERO
+    return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, path)
 
 
 def progress(s: Situation) -> int:
     """Per cent of the running order, from the phases passed."""
+    if s.state.phase is Phase.TIP_MOVE:
+        return reaching.progress(s)
     orders: tuple[tuple[Phase, ...], ...] = (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
     if s.grasping:
         orders = (_ORDER_OF_GRASP, _ORDER_OF_SETTING_DOWN, *orders)

@@ -93,6 +93,7 @@ class Order(enum.Enum):
     RELEASE = "release"
     ABORT = "abort"
     JOG = "jog"
+    REACH = "reach"
     CLEAR_ERRORS = "clear_errors"
     FEEDFORWARD = "feedforward"
 
@@ -202,6 +203,8 @@ class Setpoint:
     velocity_w: Vec3
     acceleration_w: Vec3
     yaw: float  # rad
+    # the part of the acceleration that belongs to position and velocity; the rest is for a force
+    path_w: Vec3 = field(default=(0.0, 0.0, 0.0), compare=False, metadata=UNRECORDED)
 
 
 class ArmFlag(enum.IntFlag):

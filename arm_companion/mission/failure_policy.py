@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import grasp, hang, hazards, perch, pull_test
+from arm_companion.mission import grasp, hang, hazards, perch, pull_test, reach_table
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -19,7 +19,7 @@ Guard = Callable[[Situation], str | None]
 
 SITUATIONS: dict[str, tuple[Phase, ...]] = {
     "at rest": (Phase.STARTUP, Phase.STOWED, Phase.READYING, Phase.READY, Phase.STOWING),
-    "free flight": (Phase.APPROACH, Phase.REACH, Phase.DEPART),
+    "free flight": (Phase.APPROACH, Phase.REACH, Phase.DEPART, Phase.TIP_MOVE, Phase.TIP_HOLD),
     "in contact": (Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE),
     "anchored": (Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD),
     "hanging": (Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK, Phase.HANG_HOLD),
@@ -64,7 +64,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "pilot takes the mode",
         ArmFault.PILOT_TOOK_OVER,
-        (hazards.pilot_takes_over, hang.taken_from_us, grasp.taken_over_while_setting_down),
+        (hazards.pilot_takes_over, hang.taken_from_us, grasp.taken_over_while_setting_down, reach_table.taken_over),
         "no set-points; goes on with the arm alone",
     ),
     Cause(
@@ -244,8 +244,8 @@ def cell(cause: Cause, situation: str) -> str:
 
 _HEADER = """# What happens when things go wrong
 
-Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.py` and `notices.py`. A test fails when
-the two differ.
+Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.py`, `reach_table.py` and
+`notices.py`. A test fails when the two differ.
 
 - `→` names the state that follows, in the same cycle. Every change is told as STATUSTEXT with its reason, and a
   command that is running is answered with FAILED.

@@ -5,13 +5,25 @@ import math
 import numpy as np
 
 from arm_companion.errors import CommandRejected, LimitViolated
-from arm_companion.mission.facts import Notice, Request, SetpointKind, Severity, Vec3
+from arm_companion.mission.facts import Notice, Order, Request, SetpointKind, Severity, Vec3
+from arm_companion.mission.machine import OrderRow
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, State
 from arm_companion.values import replace
 
 BEND, TIP, VEHICLE = 1, 2, 3
 """ARM_JOG_KIND."""
+
+
+def cannot_jog_vehicle(s: Situation) -> str | None:
+    """Why the anchored vehicle cannot be moved now."""
+    return None if s.external else "the vehicle is not ours to move"
+
+
+ORDERS: tuple[OrderRow[Phase, Situation], ...] = (
+    OrderRow(Order.JOG, frozenset({Phase.PERCHED}), Phase.PERCHED, frozenset({Phase.PERCHED}), cannot_jog_vehicle),
+    OrderRow(Order.JOG, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY})),
+)
 
 
 def jog(s: Situation, request: Request) -> State:

@@ -2,7 +2,7 @@
 
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
-from arm_companion.mission import actions, carry
+from arm_companion.mission import actions, carry, reaching
 from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
 from arm_companion.mission.facts import (
     Answer,
@@ -31,6 +31,7 @@ from arm_companion.mission.wrench import predict
 from arm_companion.values import replace
 
 _CLEAR_TIMEOUT_S = 6.0
+_MOVES = {Order.JOG: jog, Order.REACH: reaching.plan}
 _BESIDE = frozenset({Order.JOG, Order.FEEDFORWARD})  # orders that leave the running one alone
 
 SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
@@ -131,13 +132,13 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
             raise CommandRejected(f"{name} is not possible in state {phase.name}")
         if (reason := row.refusal(asked)) is not None:
             raise CommandRejected(reason)
-        jogged = jog(s, request) if request.order is Order.JOG else s.state
+        moved = _MOVES[request.order](s, request) if request.order in _MOVES else s.state
     except CommandRejected as rejected:
         again_later = TABLE.known(request.order)
         result = Result.TEMPORARILY_REJECTED if again_later else Result.DENIED
         answers.append(Answer(request.id, result, rejected.reason))
         return s
-    s = s.remembering(jogged)
+    s = s.remembering(moved)
     if s.state.running is not None and request.order not in _BESIDE:
         answers.append(Answer(s.state.running.request, Result.CANCELLED, f"{name} ordered"))
         s = s.remembering(replace(s.state, running=None))
@@ -159,6 +160,8 @@ def _settle(state: State, request: Request) -> State:
             return replace(state, streaming=True, errors=ArmFault.NONE)
         case Order.PERCH:
             return replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request), tries=0)
+        case Order.REACH:
+            return replace(state, errors=ArmFault.NONE)
         case Order.GRASP:
             return replace(state, errors=ArmFault.NONE, task=request.order, kind=PerchKind.ANCHOR, tries=0)
         case Order.CLEAR_ERRORS:  # a person has looked at the tendons

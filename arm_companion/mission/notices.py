@@ -23,9 +23,10 @@ from arm_companion.mission.hazards import (
 )
 from arm_companion.mission.machine import Warned
 from arm_companion.mission.perch import FREE_FLIGHT, GRASPING, GRIPPED, TENSE
+from arm_companion.mission.reach_table import left_point
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, Phase
+from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, TIP, Phase
 
 Told = Warned[Phase, Situation]
 
@@ -46,7 +47,7 @@ WARNINGS: tuple[Told, ...] = (
     ),
     *(
         Told(
-            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - CARRYING - SUSPENDED - {Phase.HOLDING},
+            frozenset(Phase) - FREE_FLIGHT - GRASPING - GRIPPED - CARRYING - SUSPENDED - TIP - {Phase.HOLDING},
             guard,
             Severity.WARNING,
             "no perch is begun",
@@ -99,6 +100,7 @@ WARNINGS: tuple[Told, ...] = (
         "the arm holds on, the set-point comes to the vehicle",
         ArmFault.SETPOINT_REJECTED,
     ),
+    Told(frozenset({Phase.TIP_HOLD}), left_point, Severity.WARNING, "the arm does what it can"),
     Told(frozenset(Phase), slack, Severity.WARNING),
     Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "a held arm's last stiffness stays"),
     Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, ground_lost, Severity.WARNING, "the autopilot decides"),

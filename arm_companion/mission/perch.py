@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import grasp, hang, tries
+from arm_companion.mission import grasp, hang, jog, reach_table, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -215,11 +215,6 @@ def cannot_perch(s: Situation) -> str | None:
     return hang.cannot_hang(s) if s.state.kind is PerchKind.HANG else None
 
 
-def cannot_jog_vehicle(s: Situation) -> str | None:
-    """Why the anchored vehicle cannot be moved now."""
-    return None if s.external else "the vehicle is not ours to move"
-
-
 Ask = OrderRow[Phase, Situation]
 STOWED_ONLY = frozenset({Phase.STOWED})
 
@@ -234,8 +229,8 @@ ORDERS: tuple[Ask, ...] = (
     ),
     Ask(Order.READY, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY}), cannot_ready),
     Ask(Order.PERCH, frozenset({Phase.READY}), Phase.APPROACH, frozenset({Phase.PERCHED, Phase.HANGING}), cannot_perch),
-    Ask(Order.JOG, frozenset({Phase.PERCHED}), Phase.PERCHED, frozenset({Phase.PERCHED}), cannot_jog_vehicle),
-    Ask(Order.JOG, frozenset({Phase.READY}), Phase.READY, frozenset({Phase.READY})),
+    *jog.ORDERS,
+    *reach_table.ORDERS,
     Ask(Order.RELEASE, GRASPING | GRIPPED, Phase.UNLOAD, STOWED_ONLY),
     Ask(Order.RELEASE, frozenset({Phase.HOLDING}), Phase.RELEASE, STOWED_ONLY, hang.cannot_open),
     Ask(Order.STOW, FREE_FLIGHT | {Phase.DEPART}, Phase.DEPART, STOWED_ONLY),
@@ -338,9 +333,11 @@ TABLE: Table[Phase, Situation] = Table(
             ArmFault.TIMEOUT,
         ),
         *grasp.ABORTS,
+        *reach_table.ABORTS,
         # progress
         *grasp.PROGRESS,
         *hang.PROGRESS,
+        *reach_table.PROGRESS,
         Row(frozenset({Phase.VERIFY}), tested_to_hang, Phase.LOAD_TRANSFER, "pull test passed, to hang"),
         Row(frozenset({Phase.STARTUP}), straight_at_start, Phase.STOWED, "arm at rest"),
         Row(frozenset({Phase.STARTUP}), bent_at_start, Phase.HOLDING, "arm holds something", ArmFault.RESTARTED),

@@ -19,6 +19,8 @@ _BEHAVIOUR = {
     Phase.STOWING: "stow",
     Phase.HOLDING: "hold",
     Phase.HANG_HOLD: "hold",
+    Phase.TIP_MOVE: "jog",
+    Phase.TIP_HOLD: "jog",
 }
 
 

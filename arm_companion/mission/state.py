@@ -1,11 +1,13 @@
 """What the mission remembers from one cycle to the next."""
 
 import enum
+import math
 from dataclasses import dataclass, field
 
 from arm_companion.arm.model import ArmSolution
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
+from arm_companion.mission.glide import Glide
 from arm_companion.mission.motion import ZERO, Reference
 from arm_companion.mission.payload import NO_LOAD, Load
 from arm_companion.mission.tendon_watch import Expected, TendonWatch
@@ -38,6 +40,8 @@ class Phase(enum.Enum):
     HANGING = 22
     TAKE_BACK = 23
     HANG_HOLD = 24
+    TIP_MOVE = 25
+    TIP_HOLD = 26
 
     __hash__ = object.__hash__  # an enumeration's own takes longer than the look-up, dozens of times in a cycle
 
@@ -45,22 +49,29 @@ class Phase(enum.Enum):
 CARRYING = frozenset({Phase.LIFT, Phase.CARRY, Phase.PLACE})
 """Phases in which the vehicle alone holds up what the arm holds."""
 
-MOVES_VEHICLE = CARRYING | frozenset(
-    {
-        Phase.APPROACH,
-        Phase.REACH,
-        Phase.CONTACT,
-        Phase.WRAP,
-        Phase.CLOSE,
-        Phase.VERIFY,
-        Phase.PERCHED,
-        Phase.UNLOAD,
-        Phase.RELEASE,
-        Phase.DEPART,
-        Phase.LOAD_TRANSFER,
-        Phase.HANGING,
-        Phase.TAKE_BACK,
-    }
+TIP = frozenset({Phase.TIP_MOVE, Phase.TIP_HOLD})
+"""Phases in which the tip is brought to a point in the world, and kept there."""
+
+MOVES_VEHICLE = (
+    CARRYING
+    | TIP
+    | frozenset(
+        {
+            Phase.APPROACH,
+            Phase.REACH,
+            Phase.CONTACT,
+            Phase.WRAP,
+            Phase.CLOSE,
+            Phase.VERIFY,
+            Phase.PERCHED,
+            Phase.UNLOAD,
+            Phase.RELEASE,
+            Phase.DEPART,
+            Phase.LOAD_TRANSFER,
+            Phase.HANGING,
+            Phase.TAKE_BACK,
+        }
+    )
 )
 """Phases whose set-points the vehicle must follow."""
 
@@ -112,7 +123,7 @@ class Prediction:
     stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
 
 
-FOLLOWS = CARRYING | frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
+FOLLOWS = CARRYING | TIP | frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART})
 """Phases in which nothing but air is between the vehicle and its reference."""
 
 
@@ -178,6 +189,37 @@ class Sharing:
 
 
 @dataclass(frozen=True)
+class Reach:
+    """A point in the world that the tip goes to.
+
+    Attributes:
+        target_w: m.
+        vehicle_w: where the vehicle hovers for it, m.
+        bend: of the plan, rad.
+        alone: whether the arm does it while the vehicle stays.
+        way_m: of the tip, when it set out.
+        vehicle: on its way; only its start while the vehicle stays.
+        shape: the bend on its way, rad; z is not used.
+        here_w: of the vehicle, from its position and velocity together, m.
+        sag_a: from the arc's tip to the real one's, base axes, m.
+        error_m: distance of tip and target, by position, attitude and the mechanics.
+        within_s: for how long the tip has been at its point.
+    """
+
+    target_w: Vec3
+    vehicle_w: Vec3
+    bend: tuple[float, float]
+    alone: bool
+    way_m: float
+    vehicle: Glide
+    shape: Glide
+    here_w: Vec3
+    sag_a: Vec3 = ZERO
+    error_m: float = math.inf
+    within_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class State:
     """Memory of the mission: plain values, so that a record holds all of it."""
 
@@ -211,5 +253,6 @@ class State:
     offset: Vec3 = ZERO  # m, asked move away from the anchor
     kind: PerchKind = PerchKind.ANCHOR  # of the perch ordered last
     sharing: Sharing = Sharing()
+    reach: Reach | None = None  # of the REACH ordered last
     errors: ArmFault = ArmFault.NONE  # latched until the next READY or PERCH
     warned: frozenset[str] = frozenset()  # notices already given in this phase

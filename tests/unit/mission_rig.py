@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request
+from arm_companion.mission.glide import Glide
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, Anchor, Phase, Sharing, State
+from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, TIP, Anchor, Phase, Reach, Sharing, State
 
 DT = 0.01
 T0 = 100.0
@@ -19,6 +20,8 @@ PLACE = (2.0, 0.0, -2.2)
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
 HUNG = Sharing(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
+REACH = Reach((2.0, 0.0, -1.83), PLACE, (0.0, 0.0), False, 1.0, Glide.rest(PLACE), Glide.rest((0.0, 0.0, 0.0)), PLACE)
+"""The tip of the straight arm, where it is."""
 HELD = CARRYING | SUSPENDED | {Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}
 """Phases in which the arm is around the bar, or around the object."""
 
@@ -40,6 +43,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "contact_w": PLACE,
         "anchor": ANCHOR if held else None,
         "sharing": HUNG if phase in SUSPENDED else Sharing(),
+        "reach": REACH if phase in TIP else None,
         "tension": (8.0, 4.0, 1.0, 4.0),
         "task": Order.GRASP if phase in CARRYING | {Phase.CLOSE} else Order.PERCH,
         "bend": bend,
