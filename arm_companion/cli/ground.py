@@ -71,6 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         if name == "grasp":
             _target(order, "object", "the middle of its axis")
     _jog(add("jog", "bend the free arm from the keyboard or by numbers, or move the anchored vehicle"))
+    _reach(add("reach", "bring the tip to a point and keep it there, by vehicle and arm together"))
     control = add("control", "take primary control, so that other stations may only stow and abort, or give it up")
     control.add_argument("verb", choices=("take", "release", "take-over"))
     _params(add("params", "list, read or set the parameters of the arm's component"))
@@ -225,6 +226,12 @@ def _jog(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle", type=float, nargs=3, metavar=("N", "E", "D"), help="move the anchored vehicle: offset in m"
     )
+
+
+def _reach(parser: argparse.ArgumentParser) -> None:
+    for name in ("north", "east", "down"):
+        parser.add_argument(name, type=float, metavar=name.upper(), help="of the point, m, autopilot's local frame")
+    parser.add_argument("--arm-only", action="store_true", help="the vehicle stays: the arm does it alone or refuses")
 
 
 def _params(parser: argparse.ArgumentParser) -> None:

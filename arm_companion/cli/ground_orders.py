@@ -233,6 +233,21 @@ def _show_jog(arguments: argparse.Namespace, jog: Jog, now: Status) -> None:
     print(f"\r{asked}   {is_at}   step {math.degrees(jog.step_rad):.1f} ", end="", flush=True)
 
 
+async def _reach(arguments: argparse.Namespace, arm: Arm) -> int:
+    def progress(per_cent: int | None) -> None:
+        say(arguments, "  REACH in progress" + ("" if per_cent is None else f", {per_cent} %"))
+
+    work = arm.reach(
+        arguments.north,
+        arguments.east,
+        arguments.down,
+        arm_only=arguments.arm_only,
+        progress=progress,
+        timeout=arguments.timeout,
+    )
+    return await follow(arguments, arm, "REACH", work)
+
+
 async def _control(arguments: argparse.Namespace, arm: Arm) -> int:
     work = (
         arm.release_control() if arguments.verb == "release" else arm.take_control(force=arguments.verb == "take-over")
@@ -271,6 +286,7 @@ def _line(parameter: Parameter) -> str:
 ACTIONS: Final[dict[str, Action]] = {
     **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort")},
     "jog": _jog,
+    "reach": _reach,
     "control": _control,
     "params": _params,
 }

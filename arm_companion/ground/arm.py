@@ -27,6 +27,7 @@ _GOALS: Final = {
     mav.MAV_CMD_ARM_PERCH: ("PERCHED", "HANGING"),
     mav.MAV_CMD_ARM_GRASP: ("CARRY",),
     mav.MAV_CMD_ARM_RELEASE: ("STOWED",),
+    mav.MAV_CMD_ARM_REACH: ("TIP_HOLD",),
 }
 """States that end a command; ARM_STATUS tells of them when the final answer gets lost."""
 
@@ -231,6 +232,29 @@ class Arm:
     async def jog_vehicle(self, north: float, east: float, down: float) -> None:
         """Move the anchored vehicle: offset in m, world NED, from where it was at the grip."""
         await self.order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_VEHICLE, north, east, down)
+
+    async def reach(
+        self,
+        north: float,
+        east: float,
+        down: float,
+        *,
+        arm_only: bool = False,
+        progress: Progress | None = None,
+        timeout: float | None = None,  # noqa: ASYNC109
+    ) -> None:
+        """Bring the tip to a point and keep it there; ends when the tip is at the point.
+
+        Args:
+            north: of the point, m, the autopilot's local NED.
+            east: of the point, m.
+            down: of the point, m.
+            arm_only: the vehicle stays where it is, and the arm does it alone or refuses.
+            progress: as `order`, in per cent of the tip's way.
+            timeout: as `order`.
+        """
+        kind = mav.ARM_REACH_KIND_ARM if arm_only else mav.ARM_REACH_KIND_TOGETHER
+        await self.order(mav.MAV_CMD_ARM_REACH, kind, north, east, down, progress=progress, timeout=timeout)
 
     async def take_control(self, *, force: bool = False) -> None:
         """Take primary control: other stations may then only stow and abort.

@@ -32,7 +32,9 @@ RESULTS: Final = {
     for value, entry in mav.enums["MAV_RESULT"].items()
 }
 
-_RESTING: Final = frozenset({"STOWED", "READY", "PERCHED", "CARRY", "HOLDING", "HANGING", "HANG_HOLD", "FAULT"})
+_RESTING: Final = frozenset(
+    {"STOWED", "READY", "TIP_HOLD", "PERCHED", "CARRY", "HOLDING", "HANGING", "HANG_HOLD", "FAULT"}
+)
 """States that the arm does not leave by itself on the way to what a command asks for."""
 
 

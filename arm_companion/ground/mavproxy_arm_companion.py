@@ -26,6 +26,7 @@ SILENT_S: Final = 5.0
 USAGE: Final = """usage: armc status|ready|perch|hang|grasp|release|stow|abort|clear
        armc jog THETA_DEG [DELTA_DEG]   bend the free arm
        armc vehicle N E D               move the anchored vehicle, m
+       armc reach N E D                 bring the tip to a point, m
        armc control take|release|take-over
        armc component [ID]              component id of the arm"""
 
@@ -73,7 +74,8 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
         self._codec = MavlinkCodec(255, 190)
         self._reports: dict[str, Report] = {}
         self._waiting: dict[int, _Waiting] = {}
-        self.add_command("armc", self.command, "continuum arm", ["<status|jog|vehicle|control|component>", *_ORDERS])
+        verbs = ["<status|jog|vehicle|reach|control|component>", *_ORDERS]
+        self.add_command("armc", self.command, "continuum arm", verbs)
 
     # Typed --------------------
 
@@ -90,6 +92,8 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
                 self._order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_BEND, theta, delta)
             elif verb == "vehicle" and len(rest) == 3:
                 self._order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_VEHICLE, *(float(word) for word in rest))
+            elif verb == "reach" and len(rest) == 3:
+                self._order(mav.MAV_CMD_ARM_REACH, mav.ARM_REACH_KIND_TOGETHER, *(float(word) for word in rest))
             elif verb == "control" and len(rest) == 1 and rest[0] in _CONTROL:
                 self._order(mav.MAV_CMD_ARM_CONTROL, _CONTROL[rest[0]])
             elif verb == "component" and len(rest) <= 1:

@@ -207,7 +207,10 @@ def _solved(tip_a: Array, start: Array, planned: Array, length: float) -> Array:
     for _ in range(_SOLVER_STEPS):
         J = arc.jacobian(u, length)[:3] / length
         off = (tip_a - arc.tip_position(u, length)) / length
-        u = u + np.linalg.solve(J.T @ J + _TO_PLAN * np.eye(2), J.T @ off + _TO_PLAN * (planned - u))
+        (a, b), (_, c) = (J.T @ J).tolist()
+        x, y = (J.T @ off + _TO_PLAN * (planned - u)).tolist()
+        a, c = a + _TO_PLAN, c + _TO_PLAN
+        u = u + np.array((c * x - b * y, a * y - b * x)) / (a * c - b * b)
     return u
 
 

@@ -249,11 +249,11 @@ class Operator:
         """Stow and land, whatever came before; a failed perch must end on the ground as well."""
         if not self._heard(self._autopilot):
             raise ScenarioFailed("the autopilot is gone")
-        quiet = ("STOWED", "READY", "HOLDING", "CARRY", "HANGING", "HANG_HOLD", "")
+        quiet = ("STOWED", "READY", "TIP_HOLD", "HOLDING", "CARRY", "HANGING", "HANG_HOLD", "")
         await self.wait(lambda: self.state in quiet, 150.0, f"the arm stays in {self.state}")
         if self.state in ("HOLDING", "CARRY", "HANGING", "HANG_HOLD"):
             await self.order(mav.MAV_CMD_ARM_RELEASE, "RELEASE", 150.0)
-        if self.state == "READY":
+        if self.state in ("READY", "TIP_HOLD"):
             await self.order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
         self.say("landing")
         await self._vehicle(mav.MAV_CMD_NAV_LAND, [0, 0, 0, float("nan"), float("nan"), float("nan"), 0], "landing")

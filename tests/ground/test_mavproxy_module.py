@@ -105,6 +105,12 @@ def test_hang_is_a_perch_of_that_kind(rig: Rig) -> None:
     assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_PERCH, 0, 1.0, *[0.0] * 6)]
 
 
+def test_reach_sends_its_point(rig: Rig) -> None:
+    rig.beat()
+    rig.type("reach 3 -2 -1.5")
+    assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_REACH, 0, 0.0, 3.0, -2.0, -1.5, *[0.0] * 3)]
+
+
 def test_what_gets_no_answer_is_repeated_and_then_told(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.beat()
     rig.type("jog 90 45")
@@ -165,7 +171,18 @@ def test_state_is_read_from_messages_that_mavproxy_does_not_know(
 
 def test_wrong_words_show_the_usage_and_send_nothing(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.beat()
-    for words in ("", "fly", "ready now", "jog", "jog x", "vehicle 1 2", "component 300", "component x", "control"):
+    for words in (
+        "",
+        "fly",
+        "ready now",
+        "jog",
+        "jog x",
+        "vehicle 1 2",
+        "reach 1 2",
+        "component 300",
+        "component x",
+        "control",
+    ):
         rig.type(words)
         assert "usage: armc" in capsys.readouterr().out, words
     assert rig.sent == []

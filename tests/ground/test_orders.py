@@ -42,6 +42,36 @@ def test_an_order_reaches_the_component_with_its_parameters(scripted: Any) -> No
     assert (sent.param1, sent.param2, sent.param3, sent.param4) == (1.0, 0.5, 0.25, 0.0)
 
 
+def test_a_reach_says_its_point_and_whether_the_vehicle_stays(scripted: Any) -> None:
+    scripted.script = lambda m: scripted.ack(m.command, ACCEPTED)
+
+    async def main() -> None:
+        await scripted.arm.reach(3.0, -2.0, -1.5)
+        await scripted.arm.reach(3.0, -2.0, -1.5, arm_only=True)
+
+    scripted.run(main)
+    assert [(m.command, m.param1, m.param2, m.param3, m.param4) for m in scripted.received] == [
+        (mav.MAV_CMD_ARM_REACH, kind, 3.0, -2.0, -1.5) for kind in (0.0, 1.0)
+    ]
+
+
+def test_a_reach_whose_answer_is_lost_ends_when_the_tip_is_held(scripted: Any, make_status: Any) -> None:
+    def script(message: Message) -> None:
+        if message.confirmation == 0:
+            scripted.ack(message.command, IN_PROGRESS)
+
+    scripted.script = script
+
+    async def main() -> None:
+        reaching = asyncio.create_task(scripted.arm.reach(3.0, -2.0, -1.5))
+        for state in ("TIP_MOVE", *["TIP_HOLD"] * 8):
+            await asyncio.sleep(0.5)
+            scripted.say(make_status(state))
+        await reaching
+
+    scripted.run(main)
+
+
 def test_a_lost_command_is_repeated_and_counts_its_confirmations(scripted: Any) -> None:
     scripted.script = lambda m: scripted.ack(m.command, ACCEPTED) if m.confirmation == 2 else None
     scripted.run(scripted.arm.ready)

@@ -203,6 +203,16 @@ def test_command_int_means_the_same(fly: Callable[..., None]) -> None:
     fly(body)
 
 
+def test_a_reach_carries_its_point(fly: Callable[..., None]) -> None:
+    async def body(rig: Rig) -> None:
+        rig.ground.command(mav.MAV_CMD_ARM_REACH, 1.0, 3.0, -2.0, -1.5)
+        await asyncio.sleep(0.01)
+        (request,), _ = rig.component.take()
+        assert (request.order, request.parameters) == (Order.REACH, (1.0, 3.0, -2.0, -1.5))
+
+    fly(body)
+
+
 def test_a_retry_while_running_does_nothing_twice(fly: Callable[..., None]) -> None:
     async def body(rig: Rig) -> None:
         for confirmation in (0, 1):
@@ -258,6 +268,9 @@ def test_a_final_answer_that_got_lost_is_repeated_but_a_new_command_is_new(fly: 
         ("JOG", (2.0, 0.0, 0.0, 20.0), "z"),
         ("JOG", (3.0, 0.0, 0.0, NAN), "param4 (z) is not a number"),
         ("JOG", (3.0, 2.0, 0.0, 0.0), "param2 (x) = 2 is outside -1 to 1"),
+        ("REACH", (2.0, 0.0, 0.0, 0.0), "param1 (kind) = 2 is outside 0 to 1"),
+        ("REACH", (0.0, 0.0, NAN, 0.0), "param3 (east) is not a number"),
+        ("REACH", (0.0, 0.0, 0.0, -2e4), "param4 (down) = -20000"),
     ],
 )
 def test_a_bad_parameter_is_denied_with_the_reason(
@@ -347,7 +360,7 @@ def test_unknown_commands_and_those_to_come_are_unsupported(fly: Callable[..., N
 
 
 def test_every_order_has_a_command() -> None:
-    assert {commands.order_of(c) for c in range(64000, 64010)} >= set(Order)
+    assert {commands.order_of(c) for c in range(64000, 64012)} >= set(Order)
 
 
 def test_requests_that_are_never_answered_do_not_pile_up(fly: Callable[..., None]) -> None:

@@ -105,7 +105,7 @@ def test_every_physical_field_of_ours_has_a_unit() -> None:
 
 
 def test_commands_stand_in_their_block_in_order() -> None:
-    names = {value: entry.name for value, entry in mav.enums["MAV_CMD"].items() if 64000 <= value < 64011}
+    names = {value: entry.name for value, entry in mav.enums["MAV_CMD"].items() if 64000 <= value < 64012}
     expected = [
         "READY",
         "STOW",
@@ -118,12 +118,16 @@ def test_commands_stand_in_their_block_in_order() -> None:
         "CLEAR_ERRORS",
         "FEEDFORWARD",
         "CONTROL",
+        "REACH",
     ]
     assert names == {64000 + i: f"MAV_CMD_ARM_{name}" for i, name in enumerate(expected)}
     assert all(commands.name_of(64000 + i) == name for i, name in enumerate(expected))
 
 
-@pytest.mark.parametrize(("command", "parameter"), [("PERCH", commands._PERCH_KIND), ("JOG", commands._JOG_KIND)])
+@pytest.mark.parametrize(
+    ("command", "parameter"),
+    [("PERCH", commands._PERCH_KIND), ("JOG", commands._JOG_KIND), ("REACH", commands._REACH_KIND)],
+)
 def test_the_ranges_that_are_enforced_are_the_documented_ones(command: str, parameter: Any) -> None:
     (param,) = TREE.iterfind(f".//entry[@name='MAV_CMD_ARM_{command}']/param[@index='{parameter.index}']")
     assert (float(param.get("minValue", "nan")), float(param.get("maxValue", "nan"))) == (

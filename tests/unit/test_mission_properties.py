@@ -70,6 +70,10 @@ PARAMETERS = {
     Order.JOG: st.tuples(st.sampled_from((1.0, 2.0, 3.0, 0.0, 9.0)), *[st.floats(-7.0, 7.0)] * 3),
     Order.FEEDFORWARD: st.sampled_from(((0.0,), (1.0,))),
     Order.PERCH: st.sampled_from(((0.0,), (1.0,))),
+    Order.REACH: st.one_of(
+        st.tuples(st.sampled_from((0.0, 1.0)), METRES, METRES, METRES),
+        st.tuples(st.sampled_from((0.0, 1.0)), st.floats(1.5, 2.5), st.floats(-0.5, 0.5), st.floats(-2.2, -1.6)),
+    ),
 }
 ORDERS = st.sampled_from(Order).flatmap(lambda order: st.tuples(st.just(order), PARAMETERS.get(order, st.just(()))))
 BARS = st.builds(

@@ -25,6 +25,20 @@ def test_without_a_force_the_set_point_stays_what_it_is() -> None:
         assert path.shaped(asked(STILL), i * DT) == asked(STILL)
 
 
+def test_the_acceleration_of_a_path_that_is_flown_stays_what_it_is() -> None:
+    """It is what ArduPilot takes it for: only the force beside it is turned into a path."""
+    together, alone = PathFeedforward(), PathFeedforward()
+    flown, lean = (0.2, 0.0, -0.1), (0.3, -0.2, 0.1)
+    both = (lean[0] + flown[0], lean[1] + flown[1], lean[2] + flown[2])
+    for i in range(200):
+        out = together.shaped(Setpoint(PLACE, STILL, both, 0.4, flown), i * DT)
+        force = alone.shaped(Setpoint(PLACE, STILL, lean, 0.4), i * DT)
+        assert out.position_w == pytest.approx(force.position_w, abs=1e-12)
+        assert [a - b for a, b in zip(out.acceleration_w, flown, strict=True)] == pytest.approx(force.acceleration_w)
+    still = PathFeedforward()
+    assert still.shaped(Setpoint(PLACE, STILL, flown, 0.4, flown), 0.0).acceleration_w == flown
+
+
 @given(
     st.lists(st.tuples(*(st.floats(-2.0, 2.0),) * 2), min_size=3, max_size=3),
     st.floats(0.1, 3.0),
