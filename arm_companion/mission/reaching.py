@@ -19,7 +19,7 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import Request, Vec3
 from arm_companion.mission.glide import Glide, glide, there
-from arm_companion.mission.motion import ZERO, Reference, add, scale, sub, yaw_of
+from arm_companion.mission.motion import ZERO, Reference, add, norm, scale, sub, yaw_of
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import TIP, Phase, Reach, State
 from arm_companion.values import replace
@@ -34,6 +34,7 @@ _AHEAD_S = 0.08  # until a bend that is asked for is there
 _SAG_S = 0.3
 _ERROR_S = 0.2
 _SOLVER_STEPS = 3
+_STOP_S = 0.02  # of the way on: a reference that moves in steps brakes a little later
 _TO_PLAN = 1e-3  # weight of the plan's bend against the tip's place, each in lengths of the arm
 _TIGHT_SHARE = 0.8  # of the tension limit, that a free bend may take
 
@@ -64,7 +65,9 @@ def plan(s: Situation, request: Request) -> State:
         raise CommandRejected("the vehicle is not flying")
     if not alone and not s.state.streaming:
         raise CommandRejected("the pilot had the vehicle: order READY first")
-    start, shape, heading = _start(s, alone=alone)
+    running = s.state.reach if s.state.phase in TIP else None
+    start, heading = _start(s, running)
+    shape = Glide.rest((*s.state.bend, 0.0)) if running is None else running.shape
     arm = reach.Arm(s.mount, s.parameters.model.parameters.L, s.parameters.model.parameters.L)
     options, now = s.config.reach, np.array(shape.position[:2])
     limits = reach.Limits(
@@ -74,7 +77,10 @@ def plan(s: Situation, request: Request) -> State:
         options.clearance_m,
         s.parameters.keep_out,
     )
-    point, vehicle = np.array(target), np.array(start.position)
+    point, vehicle = (
+        np.array(target),
+        np.array(_stop(start, options.acceleration_m_per_s2) if alone else start.position),
+    )
     try:
         if alone:
             found = reach.alone(point, vehicle, heading, arm, now, limits, options.tolerance_m)
@@ -92,8 +98,8 @@ def plan(s: Situation, request: Request) -> State:
         float(np.linalg.norm(point - tip)),
         start,
         shape,
-        s.facts.vehicle.position_w if s.state.reach is None else s.state.reach.here_w,
-        sag_a=ZERO if s.state.reach is None else s.state.reach.sag_a,
+        s.facts.vehicle.position_w if running is None else running.here_w,
+        sag_a=ZERO if running is None else running.sag_a,
     )
     # a new point on the way to another has all of the time
     since = s.t if s.state.phase is Phase.TIP_MOVE else s.state.since
@@ -104,16 +110,19 @@ def _why_alone(s: Situation, kind: float) -> str:
     return "" if kind or s.external else "; the vehicle is not ours to move"
 
 
-def _start(s: Situation, *, alone: bool) -> tuple[Glide, Glide, float]:
-    """Vehicle and bend from where the way begins, and the heading: the ways that are being made are gone on from."""
-    state, vehicle = s.state, s.facts.vehicle
-    running = state.reach if state.phase in TIP else None
-    shape = running.shape if running is not None else Glide.rest((*state.bend, 0.0))
-    if state.reference is None or not s.external:
-        return Glide.rest(vehicle.position_w), shape, yaw_of(vehicle.attitude_wb)
-    if running is not None and not running.alone and not alone:
-        return running.vehicle, shape, state.reference.yaw
-    return Glide.rest(state.reference.position), shape, state.reference.yaw
+def _start(s: Situation, running: Reach | None) -> tuple[Glide, float]:
+    """The vehicle from where its way begins, and its heading; a way that is being made is gone on from."""
+    reference, vehicle = s.state.reference, s.facts.vehicle
+    if reference is None or not s.external:
+        return Glide.rest(vehicle.position_w), yaw_of(vehicle.attitude_wb)
+    start = Glide.rest(reference.position) if running is None else running.vehicle
+    return start, reference.yaw
+
+
+def _stop(g: Glide, acceleration: float) -> Vec3:
+    """Where a reference comes to rest that brakes now, m."""
+    velocity = g.lead.velocity
+    return add(g.lead.position, scale(velocity, 0.5 * norm(velocity) / acceleration + _STOP_S))
 
 
 # --- each cycle ---
@@ -147,8 +156,6 @@ def _glide_on(s: Situation, goal: Reach) -> Reach:
     options, dt = s.config.reach, s.dt
     speed = _BEND_SPEED_SHARE * s.config.perch.bend_speed_rad_per_s
     shape = glide(goal.shape, (*goal.bend, 0.0), speed=speed, acceleration=_BEND_ACCELERATION, dt=dt)
-    if goal.alone:
-        return replace(goal, shape=shape)
     vehicle = glide(
         goal.vehicle,
         goal.vehicle_w,
@@ -180,7 +187,7 @@ def _observe(s: Situation, goal: Reach) -> Reach:
 
 def settled(goal: Reach) -> bool:
     """Whether the plan's own way is over."""
-    return there(goal.shape, (*goal.bend, 0.0)) and (goal.alone or there(goal.vehicle, goal.vehicle_w))
+    return there(goal.shape, (*goal.bend, 0.0)) and there(goal.vehicle, goal.vehicle_w)
 
 
 def _bend(s: Situation, goal: Reach) -> tuple[float, float]:

@@ -14,7 +14,7 @@ from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result,
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.reaching import bend_limit
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, State
+from arm_companion.mission.state import Phase, State, Vigil
 from arm_companion.record_codec import dumps, loads
 from tests.unit.conftest import tendons
 from tests.unit.mission_rig import DT, PLACE, Run, ask, memory, vehicle
@@ -225,6 +225,33 @@ def test_the_vehicle_stays_when_it_is_told_to(parameters: Parameters, hovering: 
     assert world.run.state.phase is Phase.TIP_HOLD
     assert {one.position_w for one in world.setpoints} == {PLACE}
     assert world.tips[-1] < 2e-3
+
+
+def test_a_vehicle_that_is_told_to_stay_on_its_way_brakes_smoothly(parameters: Parameters, hovering: Hovering) -> None:
+    world = World(Run(ready(), parameters), hovering)
+    world.go(3.0, reach_to(beside(1.5, 0.0, 0.0)))
+    here = world.setpoints[-1]
+    assert here.velocity_w[0] > 0.25
+    stop = here.position_w[0] + 0.21
+    world.go(5.0, reach_to((stop + 0.05, 0.0, beside(0.0, 0.0, -0.006)[2]), kind=1.0, request=8))
+    assert results(world.run, 8)[-1] is Result.ACCEPTED
+    assert world.setpoints[-1].position_w[0] == pytest.approx(stop, abs=0.02)
+    most = parameters.config.reach.acceleration_m_per_s2 * DT
+    for before, after in zip(world.setpoints, world.setpoints[1:], strict=False):
+        assert norm(sub(after.velocity_w, before.velocity_w)) <= most + 1e-9
+
+
+def test_an_earlier_reach_somewhere_else_leaves_nothing_behind(parameters: Parameters, hovering: Hovering) -> None:
+    world = World(Run(ready(), parameters), hovering)
+    world.go(4.0, reach_to(beside(0.05, 0.0, 0.0)))
+    world.go(2.5, lambda facts: ask(facts, Order.READY))
+    assert world.run.state.phase is Phase.READY
+    world.place = world.place + np.array((1.0, 0.0, 0.0))  # flown there by somebody else, long ago
+    x, y, z = world.place.tolist()
+    world.run.state = dataclasses.replace(world.run.state, reference=Reference((x, y, z)), vigil=Vigil())
+    world.tips.clear()
+    world.go(1.0, reach_to((x, y, z + 0.37)))
+    assert max(math.hypot(*said.status.tip_position_a[:2]) for said in world.run.said[-100:]) < 0.03
 
 
 @pytest.mark.parametrize(
