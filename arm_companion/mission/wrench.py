@@ -20,13 +20,14 @@ from arm_companion.mission.hung_wrench import hung_wrench
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, Anchor, Phase, Prediction
+from arm_companion.mission.state import CARRYING, TIP, Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
 from arm_companion.values import replace
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = CARRYING | SUSPENDED | frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE, Phase.HOLDING})
-_FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - {Phase.STARTUP, Phase.REACH}
+# a tip that reaches for a bar or a point may touch something at any moment
+_FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - TIP - {Phase.STARTUP, Phase.REACH}
 _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
 _HELD_TENSION_SIGMA = 1.0  # N, on top of it
