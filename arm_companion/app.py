@@ -1,7 +1,6 @@
 """The composition root: byte pipes and a clock in, the running daemon out."""
 
 import asyncio
-import contextlib
 import dataclasses
 import logging
 from collections.abc import Mapping
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 from arm_companion.arm import compiled
 from arm_companion.arm.model import ArmModel
 from arm_companion.arm.parameters import ArmParameters
-from arm_companion.arm.rod_model import RodModel
+from arm_companion.arm.rod_model import RodModel, compiled_model
 from arm_companion.clock import Clock, Tick, ticks
 from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
@@ -21,6 +20,7 @@ from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.mqtt_payloads import Health
+from arm_companion.drivers.recalibration import Recalibration
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_telemetry import ServoTelemetry
 from arm_companion.drivers.settings import Settings, state_directory
@@ -30,7 +30,7 @@ from arm_companion.drivers.system_status import in_trouble, system_status
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
-from arm_companion.errors import ConfigError, DeviceFault, ModelError
+from arm_companion.errors import ConfigError, DeviceFault
 from arm_companion.live.feed import Address
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
@@ -50,13 +50,7 @@ _REARM_EVERY_S = 1.0
 _HEARTBEAT_FIRST_S = 0.1  # importing numba leaves the loop little time
 _FAREWELL_S = 0.3
 _AT_REST = frozenset({Phase.STARTUP, Phase.STOWED})
-_LEVELS = {
-    Severity.CRITICAL: logging.CRITICAL,
-    Severity.ERROR: logging.ERROR,
-    Severity.WARNING: logging.WARNING,
-    Severity.NOTICE: logging.INFO,
-    Severity.INFO: logging.INFO,
-}
+_LEVELS = {Severity.CRITICAL: logging.CRITICAL, Severity.ERROR: logging.ERROR, Severity.WARNING: logging.WARNING}
 
 
 @dataclass(frozen=True)
@@ -156,6 +150,7 @@ class Daemon:
             parked=self._calibrated.parked,
             parked_window=config.calibration.turned_ticks,
         )
+        self._recalibration = Recalibration(config, self._calibrated, self._bus, self._rezero)
         self._tendons = self._calibrated.tendons(config)
         self._state = State()
         self._bar: Bar | None = None
@@ -202,6 +197,7 @@ class Daemon:
             except* DeviceFault as faults:
                 log.error("stopping: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
             finally:
+                self._recalibration.close()
                 self._calibrated.close()
                 for link in self._links:
                     link.close()
@@ -225,15 +221,9 @@ class Daemon:
         await asyncio.sleep(_HEARTBEAT_FIRST_S)
         model = self._parameters.model
 
-        def load() -> RodModel:
-            compiled.load(compiling=False)
-            fast = RodModel(model.parameters, fast=True)
-            with contextlib.suppress(ModelError):
-                fast.free([0.0] * model.parameters.n, (0.0, 0.0, 0.0))  # builds its tables
-            return fast
-
         try:
-            self._parameters = dataclasses.replace(self._parameters, model=await asyncio.to_thread(load))
+            fast = await asyncio.to_thread(compiled_model, model.parameters)
+            self._parameters = dataclasses.replace(self._parameters, model=fast)
         except compiled.NotCompiled as reason:
             log.log(logging.WARNING if compiled.installed() else logging.INFO, "mechanics on NumPy: %s", reason)
         else:
@@ -285,6 +275,7 @@ class Daemon:
         self._ready = ready
         self._servo_telemetry.publish(now, servos, self._bus.counters)
         requests, bar = self._component.take()
+        workshop = self._recalibration.facts(servos, requests, self._state.phase)
         self._bar = bar or self._bar
         guidance = self._component.guidance
         grasp_target, grasp_target_age_s = guidance.grasp_target
@@ -299,6 +290,7 @@ class Daemon:
             arm_setpoint=guidance.setpoint,
             ground_age_s=self._component.access.ground_age_s,
             calibration=self._calibrated.judge(self._bus.info, servos),
+            workshop=workshop,
         )
 
     async def _rearm(self) -> None:
@@ -327,10 +319,16 @@ class Daemon:
         match commands.arm:
             case ArmAction.DRIVE if commands.pulls is not None:
                 await self._bus.write(self._tendons.goals(commands.pulls, now), torque=True)
+            case ArmAction.WIND if commands.pulls is not None:
+                self._tendons.rest()
+                goals = self._recalibration.goals(commands.pulls, self._config.limits, now)
+                await self._bus.write(goals, torque=True)
             case ArmAction.LIMP:
-                await self._bus.limp()
+                await self._recalibration.let_go()
             case _:
                 self._tendons.rest()
+        if commands.zeros:
+            self._recalibration.store(commands.zeros, self._clock.unix(now))
         if commands.recover and (self._recovering is None or self._recovering.done()):
             self._recovering = asyncio.create_task(self._recover())
         if commands.setpoint is not None:
@@ -338,7 +336,7 @@ class Daemon:
         for answer in commands.answers:
             self._component.answer(answer)
         for notice in commands.notices:
-            log.log(_LEVELS[notice.severity], "%s", notice.text)
+            log.log(_LEVELS.get(notice.severity, logging.INFO), "%s", notice.text)
             self._component.notify(notice)
         self._component.active = self._state.phase in MOVES_VEHICLE
         self._component.status = system_status(commands.status, active=self._component.active)
@@ -364,7 +362,7 @@ class Daemon:
         self._component.status = in_trouble(last.status if last is not None else None)
         try:
             if SAFE_ACTION[self._state.phase] is ArmAction.LIMP:
-                await self._bus.limp()
+                await self._recalibration.let_go()
             if last is not None and last.setpoint is not None:
                 still = dataclasses.replace(last.setpoint, velocity_w=(0.0, 0.0, 0.0))
                 self._autopilot.send(still, tick.now)
@@ -379,6 +377,10 @@ class Daemon:
     def _why_not_stowed(self) -> str | None:
         phase = self._state.phase
         return None if phase in _AT_REST else f"it is {phase.name}"
+
+    def _rezero(self) -> None:
+        """Other zeros of the tendons are in use."""
+        self._tendons = self._calibrated.tendons(self._config)
 
     def _apply(self, config: Config) -> None:
         """Another configuration is in force; only values of `config.parameters` differ."""

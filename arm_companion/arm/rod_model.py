@@ -1,18 +1,19 @@
 """The Kirchhoff rod behind the interface of `model`: the arm's mechanics as they fly."""
 
 import math
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 
-from arm_companion.arm import rod_solver, statics
+from arm_companion.arm import compiled, rod_solver, statics
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
 from arm_companion.arm.rod_equations import Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
 from arm_companion.arm.unloaded import UnloadedArm
-from arm_companion.errors import LimitViolated, NoSolution
+from arm_companion.errors import LimitViolated, ModelError, NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
@@ -242,6 +243,19 @@ class RodModel(UnloadedArm):
         if stiffness.min() <= 0:
             raise LimitViolated("sum of tensions", float(goal.pull.sum()), 0.0, statics.buckling_tension(part))
         return np.asarray(goal.pull @ part.H / stiffness)
+
+
+def compiled_model(parameters: ArmParameters) -> RodModel:
+    """A model on compiled mechanics, as numba's cache has them, that need not build anything any more.
+
+    Raises:
+        NotCompiled: there are none.
+    """
+    compiled.load(compiling=False)
+    model = RodModel(parameters, fast=True)
+    with suppress(ModelError):
+        model.free([0.0] * parameters.n, (0.0, 0.0, 0.0))  # builds its tables
+    return model
 
 
 def _at(rod: Rod, problem: Problem, c: Array, wrench: Array) -> Solved:

@@ -3,11 +3,9 @@
 import argparse
 import contextlib
 import dataclasses
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from arm_companion import __version__
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.cli.common import add_config_arguments
 from arm_companion.cli.guide import RefusedError, Terminal, add_guide_arguments, on_the_bench, state_directory
@@ -15,17 +13,10 @@ from arm_companion.cli.numbers import NumberParser
 from arm_companion.clock import unix_now
 from arm_companion.config import Config
 from arm_companion.drivers import calibration_files as files
-from arm_companion.drivers.calibration import (
-    VERSION,
-    ServoIdentity,
-    TendonCalibration,
-    TendonZero,
-    curves,
-    identity,
-)
+from arm_companion.drivers.calibration import VERSION, Progress, ServoIdentity, curves, identity, made_of
 from arm_companion.drivers.servo_bus import ServoBus
+from arm_companion.procedures.tendon_zeros import Found, Options, Setup, Zero, least_slack, procedure
 from arm_companion.workshop.rig import Rig, m_per_tick
-from arm_companion.workshop.tendon_zeros import Found, Options, Progress, Setup, Zero, least_slack, procedure
 
 _PROGRESS = "tendons.progress.json"
 _PROGRESS_LASTS_S = 12 * 3600.0
@@ -160,25 +151,7 @@ def _store(
     zeros: tuple[Zero, ...],
     parked: dict[int, int],
 ) -> None:
-    now = unix_now()
-    tendons = tuple(
-        TendonZero(servo, direction, zero.ticks, zero.sigma, zero.friction, zero.temperature)
-        for servo, direction, zero in zip(known, config.servos.directions, zeros, strict=True)
-    )
-    _write(
-        directory / files.TENDONS,
-        TendonCalibration(
-            VERSION,
-            now,
-            datetime.fromtimestamp(now, UTC).isoformat(timespec="seconds"),
-            __version__,
-            config.arm.pulley_radius_m,
-            config.arm.tendons.pretension_n,
-            config.arm.tendons.angles_deg,
-            config.servos.coupling,
-            tendons,
-        ),
-    )
+    _write(directory / files.TENDONS, made_of(zeros, known, config, unix_now()))
     _write(directory / files.PARKED, files.Parked(tuple(parked), tuple(parked.values())))
     with contextlib.suppress(FileNotFoundError):
         (directory / _PROGRESS).unlink()

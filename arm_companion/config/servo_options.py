@@ -97,4 +97,11 @@ class CalibrationConfig:
         lower=1,
         upper=2048,
     )
+    take_up_m_per_s: float = option(
+        "of the tendons in a calibration that the ground station orders",
+        0.003,
+        unit="m/s",
+        lower=0.001,
+        upper=0.04,
+    )
     max_age_days: float = option("an older calibration is used with a warning", 90.0, unit="d", lower=0.1, upper=3650.0)

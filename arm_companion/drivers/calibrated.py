@@ -65,6 +65,17 @@ class Calibrated:
             self._judgement = judge(self._tendons, self._config, found, servos, self.parked)
         return self._judgement
 
+    @property
+    def stored(self) -> TendonCalibration | None:
+        """The tendons' calibration that the directory has; None: none that can be used."""
+        return self._tendons if isinstance(self._tendons, TendonCalibration) else None
+
+    def renew(self, calibration: TendonCalibration) -> None:
+        """Go on with another calibration of the tendons, which has been stored."""
+        self._tendons = calibration
+        self.servos = apply(calibration, self._config.servos)
+        self._key = None
+
     def tendons(self, config: Config) -> Tendons:
         """The tendons as calibrated, within the limits of `config`, which a parameter can change."""
         return Tendons(self.servos, config.limits, config.arm.pulley_radius_m, self.curves)

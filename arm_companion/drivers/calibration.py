@@ -8,7 +8,9 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 
+from arm_companion import __version__
 from arm_companion.arm.tension import LoadCurve
 from arm_companion.config.schema import Config, ServosConfig
 from arm_companion.drivers.servo_health import ServoState
@@ -16,6 +18,7 @@ from arm_companion.drivers.servo_homing import nearest_turn
 from arm_companion.drivers.servo_setup import ServoInfo
 from arm_companion.drivers.tendons import nominal_curve
 from arm_companion.mission.facts import Calibration, CalibrationState
+from arm_companion.procedures.tendon_zeros import Found, Zero
 from arm_companion.protocol.control_table import TICK_RAD
 
 VERSION = 1
@@ -64,6 +67,17 @@ class TendonCalibration:
 
 
 @dataclass(frozen=True, slots=True)
+class Progress:
+    """What an interrupted calibration on the bench has found, while the servos keep counting."""
+
+    version: int
+    made_unix_s: float
+    servos: tuple[ServoIdentity, ...]
+    pulley_radius: float  # m
+    found: tuple[Found, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class TensionFit:
     """Load to tension of one servo, as measured with known tensions."""
 
@@ -81,6 +95,33 @@ class TensionCalibration:
 
     version: int
     fits: tuple[TensionFit, ...]
+
+
+def made_of(
+    zeros: Sequence[Zero], servos: tuple[ServoIdentity, ...], config: Config, unix_s: float
+) -> TendonCalibration:
+    """The calibration to be kept.
+
+    Args:
+        zeros: as found, in the tendons' order, in the servos' own ticks.
+        servos: that are there.
+        config: what they depend on.
+        unix_s: Unix time now.
+    """
+    return TendonCalibration(
+        VERSION,
+        unix_s,
+        datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="seconds"),
+        __version__,
+        config.arm.pulley_radius_m,
+        config.arm.tendons.pretension_n,
+        config.arm.tendons.angles_deg,
+        config.servos.coupling,
+        tuple(
+            TendonZero(servo, direction, zero.ticks, zero.sigma, zero.friction, zero.temperature)
+            for servo, direction, zero in zip(servos, config.servos.directions, zeros, strict=True)
+        ),
+    )
 
 
 def misfit(calibration: TendonCalibration, config: Config) -> str:

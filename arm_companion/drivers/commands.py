@@ -98,7 +98,6 @@ URGENT: Final = frozenset({Order.STOW, Order.ABORT})
 
 _OURS: Final = range(64_000, 64_100)
 _CONTROL: Final = Parameter(1, "action", 0, 2, whole=True)
-_CALIBRATION_STEP: Final = Parameter(1, "step", 0, 1, whole=True)
 _ENABLE: Final = Parameter(1, "enable", 0, 1, whole=True)
 _GRIPPER_ACTION: Final = Parameter(2, "action", 0, 1, whole=True)
 _ACTUATOR_SET: Final = Parameter(7, "index", 0, 0, whole=True)
@@ -148,10 +147,19 @@ def read_parameters(order: Order, command: Command) -> tuple[float, ...]:
         case "REACH":
             return (_REACH_KIND.read(command), *(p.read(command) for p in _POINT))
         case "CALIBRATE":
-            return (_CALIBRATION_STEP.read(command),)
+            return _calibration(command)
         case "FEEDFORWARD":
             return (_ENABLE.read(command),)
     return ()
+
+
+def _calibration(command: Command) -> tuple[float, ...]:
+    step, sure = command.parameters[:2]
+    if step != mav.ARM_CALIBRATION_STEP_TENDONS:
+        raise CommandRejected(f"param1 = {step:g}: 1, the tendons' zeros, is all there is")
+    if sure != 1.0:
+        raise CommandRejected(f"param2 = {sure:g}: 1 confirms that nothing touches the arm")
+    return step, sure
 
 
 def read_control(command: Command) -> int:

@@ -334,6 +334,10 @@ class ServoBus:
         async with self._setting_up:
             await home(self._link, self._by_id[servo], self._zeros[servo] if near is None else near)
 
+    def renew_zeros(self, zero_ticks: Sequence[int]) -> None:
+        """Expect servos that hang straight at other zeros from now on, ticks in the servos' order."""
+        self._zeros = dict(zip(self._config.ids, zero_ticks, strict=True))
+
     async def recover(self) -> None:
         """Bring back what can be brought back, at the word of somebody who sees the arm hang straight.
 

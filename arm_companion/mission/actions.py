@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from arm_companion.mission import carry, reaching
+from arm_companion.mission import calibrating, carry, reaching
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
@@ -23,12 +23,12 @@ from arm_companion.mission.motion import (
 )
 from arm_companion.mission.sharing import SHARING, SUSPENDED, begin, hung_reference, share_on, unloading
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, TIP, PerchKind, Phase, State
+from arm_companion.mission.state import CALIBRATES, CARRYING, TIP, PerchKind, Phase, State
 from arm_companion.mission.wrench import grip
 from arm_companion.values import replace
 
 _PASSIVE = frozenset({Phase.STARTUP, Phase.STOWED, Phase.HOLDING}) | SUSPENDED
-_REFERENCE_RESTS = frozenset(
+_REFERENCE_RESTS = CALIBRATES | frozenset(
     {
         Phase.READYING,
         Phase.READY,
@@ -76,6 +76,8 @@ def prepare(s: Situation) -> State:
     """Memory at the entry of the present phase."""
     if s.state.phase in SUSPENDED:
         return begin(s)
+    if s.state.phase in CALIBRATES:
+        return calibrating.prepare(s)
     state = _prepare(s)
     return carry.prepare(s.remembering(state)) if s.grasping else state
 
@@ -89,7 +91,7 @@ def _prepare(s: Situation) -> State:
             bend = s.bend if _at_rest(s) else state.bend
             return replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
-            return replace(state, bend=s.bend, bend_goal=s.bend, pulls=())
+            return replace(state, bend=s.bend, bend_goal=s.bend, pulls=(), course=None)
         case Phase.APPROACH:
             return replace(
                 state,
@@ -134,6 +136,8 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     state = reaching.move(s) if s.state.phase in TIP else replace(s.state, reference=_reference(s), lean=_lean(s))
     if state.phase in _PASSIVE:
         return state, ArmAction.HOLD, None
+    if state.phase in CALIBRATES:
+        return calibrating.act(s.remembering(state))
     if _tight_enough(s):
         state = replace(state, bend_goal=state.bend)
     elif _loose(s):
@@ -214,6 +218,8 @@ def progress(s: Situation) -> int:
     """Per cent of the running order, from the phases passed."""
     if s.state.phase is Phase.TIP_MOVE:
         return reaching.progress(s)
+    if s.state.course is not None and s.state.phase is Phase.CALIBRATING:
+        return s.state.course.progress
     orders: tuple[tuple[Phase, ...], ...] = (_ORDER_OF_PERCH, _ORDER_OF_RELEASE)
     if s.grasping:
         orders = (_ORDER_OF_GRASP, _ORDER_OF_SETTING_DOWN, *orders)

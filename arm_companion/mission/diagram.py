@@ -6,8 +6,9 @@ from arm_companion.mission.state import Phase
 
 HEADER = """# States of perches and grasp
 
-Made from the transition table in `perch.py`, `hang.py`, `grasp.py` and `reach_table.py` of `arm_companion/mission/`; a
-test fails when the two differ. Aborts are marked ✗. Rows are tried from the table's top, so aborts win over progress.
+Made from the transition table in `perch.py`, `hang.py`, `grasp.py`, `reach_table.py` and `calibrating.py` of
+`arm_companion/mission/`; a test fails when the two differ. Aborts are marked ✗. Rows are tried from the table's top, so
+aborts win over progress.
 
 """
 

@@ -8,6 +8,8 @@ import math
 from dataclasses import dataclass, field
 from typing import TypeAlias
 
+from arm_companion.arm.tension import LoadCurve
+from arm_companion.procedures.tendon_zeros import Zero
 from arm_companion.record_codec import UNRECORDED
 
 Vec3: TypeAlias = tuple[float, float, float]
@@ -83,6 +85,21 @@ class Calibration:
     zero_sigma: float = 0.0005  # m of tendon
 
 
+@dataclass(frozen=True)
+class Workshop:
+    """What a calibration needs to know, there only while one is ordered or under way.
+
+    Attributes:
+        curves: from load to tension, of each servo.
+        m_per_tick: m of tendon that one tick of a servo winds up.
+        kept: what became of the last result: None, it is being stored; empty: stored and in use; else why not.
+    """
+
+    curves: tuple[LoadCurve, ...]
+    m_per_tick: float
+    kept: str | None = None
+
+
 class Order(enum.Enum):
     """What a person can ask of the arm."""
 
@@ -96,6 +113,7 @@ class Order(enum.Enum):
     REACH = "reach"
     CLEAR_ERRORS = "clear_errors"
     FEEDFORWARD = "feedforward"
+    CALIBRATE = "calibrate"
 
 
 @dataclass(frozen=True)
@@ -192,6 +210,7 @@ class ArmAction(enum.Enum):
 
     DRIVE = "drive"  # go to the goals given
     HOLD = "hold"  # keep the last goals
+    WIND = "wind"  # the same, with slack allowed and limits counted from where the winding began
     LIMP = "limp"  # torque off
 
 
@@ -256,6 +275,7 @@ class ArmFault(enum.IntFlag):
     NOT_CALIBRATED = 33554432
     CYCLE_OVERRUN = 67108864
     RESTARTED = 536870912
+    CALIBRATION_FAILED = 1073741824
 
 
 class WrenchSource(enum.IntEnum):
@@ -331,6 +351,7 @@ class Facts:
     arm_setpoint: ArmSetpoint | None = None  # newest that has not timed out
     ground_age_s: float = float("inf")  # since the newest heartbeat of a station that may command
     calibration: Calibration = Calibration()
+    workshop: Workshop | None = None
 
 
 @dataclass(frozen=True)
@@ -346,7 +367,7 @@ class Commands:
     """Everything that one step asks for."""
 
     arm: ArmAction
-    pulls: tuple[float, ...] | None  # m, goal of each tendon; None with HOLD and LIMP
+    pulls: tuple[float, ...] | None  # m, goal of each tendon with DRIVE and WIND
     setpoint: Setpoint | None  # None: send none, the pilot has the vehicle
     answers: tuple[Answer, ...]
     notices: tuple[Notice, ...]
@@ -357,3 +378,5 @@ class Commands:
     # follows from what is recorded, and is large
     stiffness: StiffnessReport | None = field(default=None, compare=False, metadata=UNRECORDED)
     payload: PayloadReport | None = None
+    # store them and take them into use; the notices of this cycle have them for the record
+    zeros: tuple[Zero, ...] = field(default=(), compare=False, metadata=UNRECORDED)

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import grasp, hang, hazards, perch, pull_test, reach_table
+from arm_companion.mission import calibrating, grasp, hang, hazards, perch, pull_test, reach_table
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -25,6 +25,7 @@ SITUATIONS: dict[str, tuple[Phase, ...]] = {
     "hanging": (Phase.LOAD_TRANSFER, Phase.HANGING, Phase.TAKE_BACK, Phase.HANG_HOLD),
     "carrying": (Phase.LIFT, Phase.CARRY, Phase.PLACE),
     "holding": (Phase.HOLDING,),
+    "calibrating": (Phase.CALIBRATING, Phase.EASING),
 }
 """Phases by what lies between arm, bar and vehicle. On the ground or in the air, an arm at rest does the same."""
 
@@ -52,7 +53,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "vehicle heartbeat lost",
         ArmFault.VEHICLE_LOST,
-        (hazards.vehicle_lost,),
+        (hazards.vehicle_lost, calibrating.vehicle_silent),
         "goes on: what it does needs no vehicle; no perch is begun",
     ),
     Cause(
@@ -178,6 +179,24 @@ CAUSES: tuple[Cause, ...] = (
         "nothing: a late step moves no farther than a tenth of a second allows",
     ),
     Cause(
+        "vehicle arms in a calibration",
+        ArmFault.CALIBRATION_FAILED,
+        (calibrating.vehicle_arms,),
+        "does not apply; no calibration is begun",
+    ),
+    Cause(
+        "calibration finds no zeros",
+        ArmFault.CALIBRATION_FAILED,
+        (calibrating.finds_no_zeros,),
+        "does not apply",
+    ),
+    Cause(
+        "calibration cannot be stored",
+        ArmFault.CALIBRATION_FAILED,
+        (calibrating.not_stored,),
+        "does not apply",
+    ),
+    Cause(
         "daemon restarted in flight",
         ArmFault.RESTARTED,
         (perch.straight_at_start, perch.bent_at_start),
@@ -244,8 +263,8 @@ def cell(cause: Cause, situation: str) -> str:
 
 _HEADER = """# What happens when things go wrong
 
-Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.py`, `reach_table.py` and
-`notices.py`. A test fails when the two differ.
+Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.py`, `reach_table.py`,
+`calibrating.py` and `notices.py`. A test fails when the two differ.
 
 - `→` names the state that follows, in the same cycle. Every change is told as STATUSTEXT with its reason, and a
   command that is running is answered with FAILED.
@@ -259,6 +278,8 @@ Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.
 - An arm that may carry a vehicle whose motors idle or stand never opens. What goes wrong with it brings the motors up
   (TAKE_BACK), if the vehicle is ours; if it is not, the arm holds (HANG_HOLD) until a person has the motors carry it.
 - An arm above that is found or left HOLDING goes on to HANG_HOLD at once.
+- A calibration is on the ground, and nothing depends on the arm: it is given up for anything. The tendons go back to where
+  they were, the torque becomes what it was, and the zeros that were in force stay.
 - What is carried is never let go by itself: the arm holds, and a person decides. Only a load that is gone already
   ends the carrying, in HOLDING.
 

@@ -2,7 +2,7 @@
 
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
-from arm_companion.mission import actions, carry, reaching
+from arm_companion.mission import actions, calibrating, carry, reaching
 from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
 from arm_companion.mission.facts import (
     Answer,
@@ -23,7 +23,7 @@ from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import PerchKind, Phase, Prediction, Running, State
+from arm_companion.mission.state import CALIBRATES, PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.tries import given_up
 from arm_companion.mission.vigil import keep_vigil
@@ -34,11 +34,12 @@ _CLEAR_TIMEOUT_S = 6.0
 _MOVES = {Order.JOG: jog, Order.REACH: reaching.plan}
 _BESIDE = frozenset({Order.JOG, Order.FEEDFORWARD})  # orders that leave the running one alone
 
-SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD)
+SAFE_ACTION: dict[Phase, ArmAction] = dict.fromkeys(Phase, ArmAction.HOLD) | dict.fromkeys(CALIBRATES, ArmAction.LIMP)
 """What the servos do in each phase when the cycle itself fails or the daemon is told to stop.
 
 An anchored arm must not let go by itself, a free one must not move by itself: each keeps its goals. Torque is
-never cut here, because a phase in which a limp arm is safe (stowed, on the ground) is also safe with torque on.
+cut only in a calibration, where one tendon may be pulling against nothing and the arm is to hang again; elsewhere a
+phase in which a limp arm is safe (stowed, on the ground) is also safe with torque on.
 """
 
 
@@ -66,7 +67,8 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
     recover = _begins_clearing(situation)
     situation = _finish_clearing(situation, answers)
     state, arm, pulls = actions.act(situation)
-    situation = situation.remembering(state)
+    before, situation = situation.state, situation.remembering(state)
+    zeros = calibrating.tell(before, situation, answers, notices)
     prediction = predict(situation)
     state = replace(
         _warn(situation, notices),
@@ -87,6 +89,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         tensions=_tensions(facts, state, prediction),
         stiffness=prediction.stiffness,
         payload=carry.report(situation),
+        zeros=zeros,
     )
     return state, commands
 
@@ -158,6 +161,8 @@ def _settle(state: State, request: Request) -> State:
     match request.order:
         case Order.READY:
             return replace(state, streaming=True, errors=ArmFault.NONE)
+        case Order.CALIBRATE:
+            return replace(state, errors=ArmFault.NONE)
         case Order.PERCH:
             return replace(state, errors=ArmFault.NONE, task=request.order, kind=_kind(request), tries=0)
         case Order.REACH:

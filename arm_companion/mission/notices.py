@@ -26,7 +26,7 @@ from arm_companion.mission.perch import FREE_FLIGHT, GRASPING, GRIPPED, TENSE
 from arm_companion.mission.reach_table import left_point
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, TIP, Phase
+from arm_companion.mission.state import CALIBRATES, CARRYING, MOVES_VEHICLE, TIP, Phase
 
 Told = Warned[Phase, Situation]
 
@@ -101,7 +101,7 @@ WARNINGS: tuple[Told, ...] = (
         ArmFault.SETPOINT_REJECTED,
     ),
     Told(frozenset({Phase.TIP_HOLD}), left_point, Severity.WARNING, "the arm does what it can"),
-    Told(frozenset(Phase), slack, Severity.WARNING),
+    Told(frozenset(Phase) - CALIBRATES, slack, Severity.WARNING),
     Told(MOVES_VEHICLE, model_blind, Severity.WARNING, "a held arm's last stiffness stays"),
     Told(frozenset(Phase) - {Phase.STARTUP, Phase.STOWED}, ground_lost, Severity.WARNING, "the autopilot decides"),
     Told(frozenset(Phase), overrun, Severity.WARNING, error=ArmFault.CYCLE_OVERRUN),

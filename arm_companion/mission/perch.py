@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import grasp, hang, jog, reach_table, tries
+from arm_companion.mission import calibrating, grasp, hang, jog, reach_table, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -255,6 +255,7 @@ ORDERS: tuple[Ask, ...] = (
         )
     ),
     *hang.ORDERS,
+    *calibrating.ORDERS,
 )
 
 _ENDS_A_BEGINNING = ((FREE_FLIGHT, Phase.DEPART), (GRASPING | {Phase.VERIFY}, Phase.UNLOAD))
@@ -295,13 +296,7 @@ TABLE: Table[Phase, Situation] = Table(
             "estimator jump",
             ArmFault.ESTIMATOR_JUMP,
         ),
-        Row(
-            GRASPING | {Phase.VERIFY},
-            estimator_jumped,
-            Phase.UNLOAD,
-            "estimator jump",
-            ArmFault.ESTIMATOR_JUMP,
-        ),
+        Row(GRASPING | {Phase.VERIFY}, estimator_jumped, Phase.UNLOAD, "estimator jump", ArmFault.ESTIMATOR_JUMP),
         Row(FREE_FLIGHT | {Phase.DEPART}, astray, Phase.STOWING, "set-points not followed", ArmFault.SETPOINT_REJECTED),
         # then the arm: nothing new is begun with it, and a grip that is tested already stays until a person says
         *(
@@ -334,8 +329,10 @@ TABLE: Table[Phase, Situation] = Table(
         ),
         *grasp.ABORTS,
         *reach_table.ABORTS,
+        *calibrating.ABORTS,
         # progress
         *grasp.PROGRESS,
+        *calibrating.PROGRESS,
         *hang.PROGRESS,
         *reach_table.PROGRESS,
         Row(frozenset({Phase.VERIFY}), tested_to_hang, Phase.LOAD_TRANSFER, "pull test passed, to hang"),
@@ -360,6 +357,7 @@ TABLE: Table[Phase, Situation] = Table(
         # time limits last: progress in the same cycle wins
         *hang.LIMITS,
         *grasp.TIME_LIMITS,
+        *calibrating.LIMITS,
         Row(frozenset({Phase.APPROACH}), state_timeout, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
         Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),

@@ -7,16 +7,21 @@ from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Con
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.sharing import SHARING
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, Phase, Prediction
+from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction
 
 _OVERLOAD = 0x20  # hardware-error bit of a servo
 _TOUCHES = CARRYING | SHARING | {Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD}
+_WANTED = ArmFault.TENDON_SLACK | ArmFault.MODEL | ArmFault.NOT_CALIBRATED
+"""What is no trouble in a calibration, but its way, or what it mends."""
+
 _BEHAVIOUR = {
     Phase.STARTUP: "startup",
     Phase.STOWED: "stowed",
     Phase.READYING: "ready",
     Phase.READY: "ready",
     Phase.STOWING: "stow",
+    Phase.CALIBRATING: "calibrate",
+    Phase.EASING: "calibrate",
     Phase.HOLDING: "hold",
     Phase.HANG_HOLD: "hold",
     Phase.TIP_MOVE: "jog",
@@ -40,7 +45,7 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
         tip_position_a=prediction.tip_a,
         goal_theta=goal_theta,
         goal_delta=goal_delta,
-        calibration=s.facts.calibration.state,
+        calibration=CalibrationState.RUNNING if s.state.phase is Phase.CALIBRATING else s.facts.calibration.state,
     )
 
 
@@ -92,7 +97,8 @@ def _present_faults(s: Situation) -> ArmFault:
         (ArmFault.NOT_CALIBRATED, bool(s.facts.calibration.refusal)),
         (ArmFault.TENDON_OVER_TENSION, any(t.tension > s.config.limits.tension_max_n for t in tendons)),
     )
-    return ArmFault(sum(fault for fault, present in there if present))
+    present = ArmFault(sum(fault for fault, holds in there if holds))
+    return present & ~_WANTED if s.state.phase in CALIBRATES else present
 
 
 def _polar(u: tuple[float, float]) -> tuple[float, float]:

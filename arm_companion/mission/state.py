@@ -5,6 +5,7 @@ import math
 from dataclasses import dataclass, field
 
 from arm_companion.arm.model import ArmSolution
+from arm_companion.mission.course import Course
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
 from arm_companion.mission.glide import Glide
@@ -37,17 +38,22 @@ class Phase(enum.Enum):
     LIFT = 17
     CARRY = 18
     PLACE = 19
+    CALIBRATING = 20
     HANGING = 22
     TAKE_BACK = 23
     HANG_HOLD = 24
     TIP_MOVE = 25
     TIP_HOLD = 26
+    EASING = 27
 
     __hash__ = object.__hash__  # an enumeration's own takes longer than the look-up, dozens of times in a cycle
 
 
 CARRYING = frozenset({Phase.LIFT, Phase.CARRY, Phase.PLACE})
 """Phases in which the vehicle alone holds up what the arm holds."""
+
+CALIBRATES = frozenset({Phase.CALIBRATING, Phase.EASING})
+"""Phases in which tendons are wound one by one, from slack to tight, wherever their zeros are."""
 
 TIP = frozenset({Phase.TIP_MOVE, Phase.TIP_HOLD})
 """Phases in which the tip is brought to a point in the world, and kept there."""
@@ -254,5 +260,6 @@ class State:
     kind: PerchKind = PerchKind.ANCHOR  # of the perch ordered last
     sharing: Sharing = Sharing()
     reach: Reach | None = None  # of the REACH ordered last
-    errors: ArmFault = ArmFault.NONE  # latched until the next READY or PERCH
+    course: Course | None = None  # of the calibration under way
+    errors: ArmFault = ArmFault.NONE  # latched until the next READY, PERCH or CALIBRATE
     warned: frozenset[str] = frozenset()  # notices already given in this phase

@@ -20,14 +20,15 @@ from arm_companion.mission.hung_wrench import hung_wrench
 from arm_companion.mission.motion import ZERO, sub
 from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CARRYING, TIP, Anchor, Phase, Prediction
+from arm_companion.mission.state import CALIBRATES, CARRYING, TIP, Anchor, Phase, Prediction
 from arm_companion.mission.tendon_watch import Expected
 from arm_companion.values import replace
 
 _ANCHORED = frozenset({Phase.PERCHED, Phase.UNLOAD, Phase.VERIFY})
 _TOUCHING = CARRYING | SUSPENDED | frozenset({Phase.CONTACT, Phase.WRAP, Phase.CLOSE, Phase.RELEASE, Phase.HOLDING})
+_ZEROS_UNKNOWN = CALIBRATES | {Phase.STARTUP}
 # a tip that reaches for a bar or a point may touch something at any moment
-_FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - TIP - {Phase.STARTUP, Phase.REACH}
+_FREE = frozenset(Phase) - _ANCHORED - _TOUCHING - TIP - _ZEROS_UNKNOWN - {Phase.REACH}
 _FREE_TENSION_SPREAD = 0.05  # one sigma of the statics' tensions from the arm's parameters, relative
 _HELD_TENSION_SPREAD = 0.1  # the same with a bar in the way
 _HELD_TENSION_SIGMA = 1.0  # N, on top of it
@@ -75,6 +76,8 @@ def predict(s: Situation) -> Prediction:
 
 def equilibria(s: Situation) -> tuple[ArmSolution | None, ArmSolution | None, bool]:
     """The free arm, None where none was found; the last anchored one while something is, and whether it is of now."""
+    if s.state.phase in CALIBRATES:  # of tendons that are slack, and whose zeros are looked for, nothing follows
+        return None, None, False
     last = s.state.prediction
     free = None
     with suppress(ModelError):
@@ -114,7 +117,7 @@ def _tensions(s: Situation, free: ArmSolution | None) -> tuple[Expected, ...]:
         if free is None:
             return ()
         tension, spread, extra = free.tension, _FREE_TENSION_SPREAD, 0.0
-    elif s.state.phase is Phase.STARTUP:
+    elif s.state.phase in _ZEROS_UNKNOWN:
         return ()
     else:
         tension = statics.stretch_tension(arm, np.asarray(s.bend), np.asarray(s.pulls))

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import dataclasses
-from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol, TypeVar
 
@@ -13,9 +12,7 @@ from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.tendons import Tendons
 from arm_companion.errors import ArmError, DeviceFault
-from arm_companion.mission.motion import ramp
-from arm_companion.protocol.control_table import TICK_RAD
-from arm_companion.workshop.actions import (
+from arm_companion.procedures.actions import (
     Action,
     Ask,
     AskNumber,
@@ -26,15 +23,12 @@ from arm_companion.workshop.actions import (
     Release,
     Sample,
     Say,
-    Stop,
     Trace,
 )
+from arm_companion.procedures.moves import Moving
+from arm_companion.protocol.control_table import TICK_RAD
 
 PERIOD_S = 0.01
-_SETTLE_M = 0.0003
-_SETTLE_S = 1.0
-_SMOOTHED = 20  # readings
-_STARTING = 15  # cycles in which a servo gathers speed, which looks like a load
 _TORQUE_S = 2.0
 _EASE_M_PER_S = 0.02
 _EASE_S = 6.0
@@ -219,34 +213,21 @@ class Rig:
 
         Raises:
             DeviceFault: a servo failed.
+            Refused: one does not follow.
         """
         start = self._goal
         if start is None:
             raise Aborted("the torque is off")
-        way = max(abs(goal - begin) for goal, begin in zip(action.wound, start, strict=True))
-        samples: list[Sample] = []
-        recent: deque[float] = deque(maxlen=_SMOOTHED)
-        gone, arrived_at = 0.0, None
-        async for tick in ticks(PERIOD_S):
-            gone = ramp(gone, way, action.speed, PERIOD_S)
-            share = gone / way if way > 0.0 else 1.0
-            self._goal = tuple(begin + share * (goal - begin) for goal, begin in zip(action.wound, start, strict=True))
+        moving = Moving(action, start)
+        async for _ in ticks(PERIOD_S):
+            moving = moving.on(PERIOD_S)
+            self._goal = moving.goal
             sample = self._sample(await self._cycle())
-            samples.append(sample)
-            if action.stop is not None and len(samples) > _STARTING and self._reached(action.stop, sample, recent):
-                self._goal = sample.wound  # and no further
-                return Trace(tuple(samples), stopped=True)
-            if gone < way:
-                continue
-            arrived_at = tick.now if arrived_at is None else arrived_at
-            off = max(abs(w - goal) for w, goal in zip(sample.wound, action.wound, strict=True))
-            if off < _SETTLE_M or tick.now - arrived_at > _SETTLE_S:
-                break
-        return Trace(tuple(samples))
-
-    def _reached(self, stop: Stop, sample: Sample, recent: "deque[float]") -> bool:
-        recent.append(stop.of(sample.load))
-        return len(recent) == _SMOOTHED and sum(recent) / _SMOOTHED > stop.load
+            moving, trace = moving.measured(sample)
+            if trace is not None:
+                self._goal = sample.wound if trace.stopped else self._goal  # and no further
+                return trace
+        raise Aborted("time has ended")
 
     def _sample(self, states: Sequence[ServoState]) -> Sample:
         signs, tendons = self._config.directions, self._tendons

@@ -13,8 +13,7 @@ import numpy as np
 from arm_companion.arm.least_squares import student
 from arm_companion.arm.tension import LoadCurve
 from arm_companion.errors import ModelError
-from arm_companion.workshop.actions import Ask, AskNumber, Engage, Move, Procedure, Release, Say, Trace
-from arm_companion.workshop.tendon_zeros import Refused
+from arm_companion.procedures.actions import Ask, AskNumber, Engage, Move, Procedure, Refused, Release, Say, Trace
 
 STANDARD_GRAVITY = 9.80665
 _LEAD = 10  # samples in which a servo starts or stops

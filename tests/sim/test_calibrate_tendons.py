@@ -19,11 +19,11 @@ from arm_companion.drivers import calibration_files as files
 from arm_companion.drivers.calibration import TendonCalibration, TensionCalibration
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.tendons import nominal_curve
+from arm_companion.procedures.tendon_zeros import Options, Setup, Zero, procedure
 from arm_companion.protocol import control_table as ct
 from arm_companion.sim import servo_device
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator
 from arm_companion.workshop.rig import Rig, m_per_tick
-from arm_companion.workshop.tendon_zeros import Options, Setup, Zero, procedure
 from tests.sim.bench_arm import BenchArm
 from tests.unit.test_procedures import hanging
 

@@ -12,7 +12,7 @@ from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
-from arm_companion.mission.state import CARRYING, MOVES_VEHICLE, TIP, Anchor, Phase, Reach, Sharing, State
+from arm_companion.mission.state import CALIBRATES, CARRYING, MOVES_VEHICLE, TIP, Anchor, Phase, Reach, Sharing, State
 
 DT = 0.01
 T0 = 100.0
@@ -119,8 +119,15 @@ class Run:
             assert norm(setpoint.velocity_w) <= fastest + 1e-9
             if state.phase not in MOVES_VEHICLE and facts.vehicle.control is Control.EXTERNAL:
                 assert setpoint.velocity_w == (0.0, 0.0, 0.0), "nobody asked the vehicle to move"
-        assert commands.arm is not ArmAction.LIMP, "a limp arm drops what it holds"
-        assert (commands.pulls is not None) == (commands.arm is ArmAction.DRIVE)
+        if state.phase in CALIBRATES:
+            assert commands.arm is not ArmAction.DRIVE, "where straight is, nobody knows"
+        else:
+            assert commands.arm is not ArmAction.LIMP, "a limp arm drops what it holds"
+            assert commands.arm is not ArmAction.WIND
+        assert (commands.pulls is not None) == (commands.arm in (ArmAction.DRIVE, ArmAction.WIND))
+        if state.phase is Phase.CALIBRATING:
+            assert not facts.vehicle.armed
+            assert facts.vehicle.landed
         if state.phase in {Phase.STARTUP, Phase.STOWED, Phase.HOLDING}:
             assert commands.arm is ArmAction.HOLD, "nothing moves until told"
         if commands.pulls is not None:

@@ -14,10 +14,21 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.tension import LoadCurve
 from arm_companion.config import Config
 from arm_companion.errors import ModelError, NoSolution
+from arm_companion.procedures.actions import (
+    Action,
+    Ask,
+    AskNumber,
+    Engage,
+    Keep,
+    Move,
+    Procedure,
+    Release,
+    Sample,
+    Trace,
+)
+from arm_companion.procedures.take_up import balanced, combine, knee
+from arm_companion.procedures.tendon_zeros import Found, Options, Refused, Setup, Zero, least_slack, procedure
 from arm_companion.protocol.control_table import TICK_RAD
-from arm_companion.workshop.actions import Action, Ask, AskNumber, Engage, Keep, Move, Procedure, Release, Sample, Trace
-from arm_companion.workshop.take_up import balanced, combine, knee
-from arm_companion.workshop.tendon_zeros import Found, Options, Refused, Setup, Zero, least_slack, procedure
 from arm_companion.workshop.tension_gain import STANDARD_GRAVITY, Bench, Reading, describe, fit
 from arm_companion.workshop.tension_gain import procedure as tension_procedure
 

@@ -4,7 +4,13 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Any, TypeAlias, TypeVar
 
+from arm_companion.errors import ArmError
+
 T = TypeVar("T")
+
+
+class Refused(ArmError):
+    """A procedure cannot go on; the message says what to look for."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -64,19 +64,21 @@ def knee(wound: Sequence[float], load: Sequence[float], inwards: Sequence[bool])
     way = np.asarray(inwards, dtype=np.bool_)
     if min(int(way.sum()), int((~way).sum())) < _LEAST_SAMPLES:
         raise NoSolution(math.inf, "too few readings")
+    hinge = _Hinge(w, y, way)
     low, high = float(w.min()), float(w.max())
     at = low
     for _ in range(_REFINEMENTS):
         grid = np.linspace(low, high, _GRID)
-        k = int(np.argmin([_hinge(w, y, way, float(g))[1] for g in grid]))
+        k = int(np.argmin(hinge.cost(grid)))
         at, low, high = float(grid[k]), float(grid[max(k - 1, 0)]), float(grid[min(k + 1, _GRID - 1)])
-    x, cost = _hinge(w, y, way, at)
+    A = np.column_stack((way, ~way, np.maximum(w - at, 0.0)))
+    x, *_ = np.linalg.lstsq(A, y, rcond=None)
     level_in, level_out, slope = (float(v) for v in x)
-    r = y - _basis(w, way, at) @ x
+    r = y - A @ x
     if not slope > 0.0:
         raise NoSolution(math.inf, "the load does not rise")
-    J = np.column_stack((-slope * (w > at), way, ~way, np.maximum(w - at, 0.0))).astype(np.float64)
-    variance = cost / max(w.size - 4, 1)
+    J = np.column_stack((-slope * (w > at), A))
+    variance = float(r @ r) / max(w.size - 4, 1)
     try:
         sigma = math.sqrt(variance * float(np.linalg.inv(J.T @ J)[0, 0]))
     except (np.linalg.LinAlgError, ValueError):
@@ -84,16 +86,47 @@ def knee(wound: Sequence[float], load: Sequence[float], inwards: Sequence[bool])
     return Knee(at, sigma * _correlation(r), slope, level_in, level_out, math.sqrt(variance))
 
 
-def _hinge(w: Array, y: Array, way: npt.NDArray[np.bool_], at: float) -> tuple[Array, float]:
-    """Levels and slope of the best hinge with its knee `at` (3,), and its sum of squares."""
-    A = _basis(w, way, at)
-    x, *_ = np.linalg.lstsq(A, y, rcond=None)
-    r = y - A @ x
-    return np.asarray(x, dtype=np.float64), float(r @ r)
+class _Hinge:
+    """Sums of squares that the best levels and slope leave, for any place of the knee.
+
+    From sums over the readings beyond the knee, so that hundreds of places cost no more than one fit does: the daemon
+    asks within a cycle.
+
+    Args:
+        w: (q,) m wound up.
+        y: (q,) share of full load.
+        way: (q,) whether the servo took in.
+    """
+
+    def __init__(self, w: Array, y: Array, way: npt.NDArray[np.bool_]) -> None:
+        order = np.argsort(w, kind="stable")
+        self._w = w[order]
+        # about their means: differences of large sums would lose what is looked for
+        self._middle = float(w.mean())
+        w, y = self._w - self._middle, y[order] - y.mean()
+        ways = np.column_stack((way[order], ~way[order])).astype(np.float64)
+        self._count, self._load = ways.sum(axis=0), ways.T @ y
+        self._total = float(y @ y) - float(np.sum(self._load**2 / self._count))
+        # each row: of all readings from there on
+        self._n, self._sum = _from_here(ways), _from_here(ways * w[:, None])
+        self._square, self._y, self._wy = (_from_here(v[:, None])[:, 0] for v in (w * w, y, w * y))
+
+    def cost(self, at: Array) -> Array:
+        """Sums of squares (k,) with the knee at (k,), m."""
+        first, at = np.searchsorted(self._w, at, side="right"), at - self._middle
+        n, total = self._n[first], self._sum[first]
+        h = total - at[:, None] * n  # sums of max(w - at, 0), for each way
+        hh = self._square[first] - 2.0 * at * total.sum(axis=1) + at * at * n.sum(axis=1)
+        hy = self._wy[first] - at * self._y[first]
+        spread = hh - (h * h / self._count).sum(axis=1)
+        gain = hy - (h * self._load / self._count).sum(axis=1)
+        seen = spread > 1e-9 * max(float(self._square[0]), 1e-30)
+        return np.asarray(self._total - np.where(seen, gain * gain / np.where(seen, spread, 1.0), 0.0))
 
 
-def _basis(w: Array, way: npt.NDArray[np.bool_], at: float) -> Array:
-    return np.column_stack((way, ~way, np.maximum(w - at, 0.0)))
+def _from_here(v: Array) -> Array:
+    """Sums (q + 1, k) of the rows of v (q, k) from each one to the last; the last row is none."""
+    return np.vstack((np.cumsum(v[::-1], axis=0)[::-1], np.zeros((1, v.shape[1]))))
 
 
 def _correlation(r: Array) -> float:

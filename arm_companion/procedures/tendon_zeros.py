@@ -8,11 +8,22 @@ import numpy as np
 
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.tension import LoadCurve
-from arm_companion.drivers.calibration import ServoIdentity
-from arm_companion.errors import ArmError, ModelError
+from arm_companion.errors import ModelError
 from arm_companion.geometry.arrays import Array
-from arm_companion.workshop.actions import Ask, Engage, Keep, Move, Procedure, Release, Sample, Say, Stop, Trace
-from arm_companion.workshop.take_up import balanced, combine, knee
+from arm_companion.procedures.actions import (
+    Ask,
+    Engage,
+    Keep,
+    Move,
+    Procedure,
+    Refused,
+    Release,
+    Sample,
+    Say,
+    Stop,
+    Trace,
+)
+from arm_companion.procedures.take_up import balanced, combine, knee
 
 _FREE_RUN_M = 0.008
 _STROKES = 8
@@ -28,10 +39,6 @@ _STIFFNESS_SPREAD = 0.2  # relative, of the tendons' stiffness
 _LEVEL_READINGS = 300  # about as many tell the load of a slack servo
 _LET_OUT_TRIES = 3
 _TIGHT = 1.5  # times the pretension, to which all tendons are taken together
-
-
-class Refused(ArmError):
-    """The procedure cannot go on; the message says what to look for."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,17 +67,6 @@ class Found:
     noise: float
     friction: float  # N
     temperature: float  # degC
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """What has been found so far, while the servos keep counting."""
-
-    version: int
-    made_unix_s: float
-    servos: tuple[ServoIdentity, ...]
-    pulley_radius: float  # m
-    found: tuple[Found, ...]
 
 
 @dataclass(frozen=True, slots=True)
