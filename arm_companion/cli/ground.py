@@ -31,6 +31,10 @@ _CODES: Final = """exit codes:
   130  ended by Ctrl-C before its end
 """
 
+_SURE: Final = """The arm takes up its tendons one by one for some four minutes, and bends by 60 degrees to each side.
+It must hang straight down and free, nothing and nobody may touch it, and the propellers must not turn.
+The result is stored and used at once. Ctrl-C twice gives it up. Go on? [y/N] """
+
 _ORDERS: Final = {
     "ready": "torque on, pretension, straight",
     "perch": "perch on the bar; ends when the grip is verified, or when the vehicle hangs",
@@ -70,6 +74,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             )
         if name == "grasp":
             _target(order, "object", "the middle of its axis")
+    calibrate = add("calibrate", "find the tendons' zeros by the daemon: on the ground, disarmed, the arm hanging free")
+    calibrate.add_argument("--yes", action="store_true", help="nothing and nobody touches the arm: do not ask")
     _jog(add("jog", "bend the free arm from the keyboard or by numbers, or move the anchored vehicle"))
     _reach(add("reach", "bring the tip to a point and keep it there, by vehicle and arm together"))
     control = add("control", "take primary control, so that other stations may only stow and abort, or give it up")
@@ -95,6 +101,8 @@ def run(arguments: argparse.Namespace) -> int:
         if importlib.util.find_spec(name) is None:
             print(f"arm-companion ground needs '{name}': pip install 'arm-companion[ground]'", file=sys.stderr)
             return USAGE
+    if arguments.action == "calibrate" and not arguments.yes and (code := _refused_by_person(arguments)) is not None:
+        return code
     from arm_companion.cli import ground_orders, ground_show  # noqa: PLC0415 - after the check for the extra
 
     table: dict[str, Action] = {**ground_show.ACTIONS, **ground_orders.ACTIONS}
@@ -112,6 +120,18 @@ def tell(arguments: argparse.Namespace, **facts: Any) -> None:
     """The result for programs: one JSON object on a line of its own, with --json only."""
     if arguments.json:
         print(json.dumps(facts), flush=True)
+
+
+def _refused_by_person(arguments: argparse.Namespace) -> int | None:
+    """Ask on standard error, as standard output may be for a program; None: go on, else the exit code."""
+    print(_SURE, end="", file=sys.stderr, flush=True)
+    try:
+        answer = sys.stdin.readline()
+    except KeyboardInterrupt:
+        return _ended(arguments, INTERRUPTED, "interrupted", "")
+    if answer.strip().lower() in ("y", "yes"):
+        return None
+    return _ended(arguments, FAILED, "declined", "", "nothing is done")
 
 
 def _with_arm(arguments: argparse.Namespace, action: Action) -> int:
@@ -163,6 +183,8 @@ def _wrong_usage(arguments: argparse.Namespace) -> str:
         case "grasp":
             together = {arguments.object is None, arguments.object_axis_deg is None, arguments.object_radius is None}
             return "" if len(together) == 1 else "--object, --object-axis-deg and --object-radius belong together"
+        case "calibrate" if not (arguments.yes or sys.stdin.isatty()):
+            return "nobody is there to confirm that nothing touches the arm: give --yes"
         case "jog" if arguments.theta_deg is None and arguments.vehicle is None and not sys.stdin.isatty():
             return "the keyboard needs a terminal; without one give --theta-deg or --vehicle"
     return ""

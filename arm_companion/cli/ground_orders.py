@@ -284,7 +284,7 @@ def _line(parameter: Parameter) -> str:
 
 
 ACTIONS: Final[dict[str, Action]] = {
-    **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort")},
+    **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort", "calibrate")},
     "jog": _jog,
     "reach": _reach,
     "control": _control,

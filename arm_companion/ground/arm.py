@@ -221,6 +221,15 @@ class Arm:
         """Bring the load to zero, let go, clear what was held."""
         await self.order(mav.MAV_CMD_ARM_RELEASE, progress=progress, timeout=timeout)
 
+    async def calibrate(self, progress: Progress | None = None, timeout: float | None = None) -> None:  # noqa: ASYNC109
+        """Find the tendons' zeros, which are stored and used at once; takes minutes.
+
+        Calling it is the word that nothing and nobody touches the arm, which hangs free and bends by 60 degrees to each
+        side. Refused unless the arm is stowed and the vehicle disarmed, on the ground.
+        """
+        step, sure = mav.ARM_CALIBRATION_STEP_TENDONS, 1
+        await self.order(mav.MAV_CMD_ARM_CALIBRATE, step, sure, progress=progress, timeout=timeout)
+
     async def abort(self, timeout: float | None = None) -> None:  # noqa: ASYNC109
         """Leave whatever runs on its shortest safe way. Legal at any time."""
         await self.order(mav.MAV_CMD_ARM_ABORT, timeout=timeout)

@@ -27,6 +27,7 @@ USAGE: Final = """usage: armc status|ready|perch|hang|grasp|release|stow|abort|c
        armc jog THETA_DEG [DELTA_DEG]   bend the free arm
        armc vehicle N E D               move the anchored vehicle, m
        armc reach N E D                 bring the tip to a point, m
+       armc calibrate yes               the tendons' zeros; yes: nothing touches the arm
        armc control take|release|take-over
        armc component [ID]              component id of the arm"""
 
@@ -74,7 +75,7 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
         self._codec = MavlinkCodec(255, 190)
         self._reports: dict[str, Report] = {}
         self._waiting: dict[int, _Waiting] = {}
-        verbs = ["<status|jog|vehicle|reach|control|component>", *_ORDERS]
+        verbs = ["<status|jog|vehicle|reach|calibrate|control|component>", *_ORDERS]
         self.add_command("armc", self.command, "continuum arm", verbs)
 
     # Typed --------------------
@@ -94,6 +95,8 @@ class ArmModule(mp_module.MPModule):  # type: ignore[misc]  # MAVProxy has no ty
                 self._order(mav.MAV_CMD_ARM_JOG, mav.ARM_JOG_KIND_VEHICLE, *(float(word) for word in rest))
             elif verb == "reach" and len(rest) == 3:
                 self._order(mav.MAV_CMD_ARM_REACH, mav.ARM_REACH_KIND_TOGETHER, *(float(word) for word in rest))
+            elif verb == "calibrate" and rest == ["yes"]:
+                self._order(mav.MAV_CMD_ARM_CALIBRATE, mav.ARM_CALIBRATION_STEP_TENDONS, 1)
             elif verb == "control" and len(rest) == 1 and rest[0] in _CONTROL:
                 self._order(mav.MAV_CMD_ARM_CONTROL, _CONTROL[rest[0]])
             elif verb == "component" and len(rest) <= 1:

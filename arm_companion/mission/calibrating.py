@@ -178,19 +178,20 @@ def prepare(s: Situation) -> State:
     workshop = s.facts.workshop
     if workshop is None or not s.facts.tendons:
         return replace(s.state, course=None)
-    return replace(s.state, course=course.begin(_setup(s, workshop), s.facts.tendons), pulls=())
+    return replace(s.state, course=course.begin(setup_of(s.config, workshop), s.facts.tendons), pulls=())
 
 
-def _setup(s: Situation, workshop: Workshop) -> Setup:
-    servos = s.config.servos
+def setup_of(config: Config, workshop: Workshop) -> Setup:
+    """What the procedure needs to know of the arm."""
+    servos = config.servos
     return Setup(
-        ArmParameters.of(s.config.arm),
+        ArmParameters.of(config.arm),
         workshop.curves,
         servos.directions,
         servos.ids,
         workshop.m_per_tick,
-        s.config.limits.tension_max_n,
-        options_of(s.config),
+        config.limits.tension_max_n,
+        options_of(config),
     )
 
 

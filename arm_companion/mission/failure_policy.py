@@ -182,7 +182,7 @@ CAUSES: tuple[Cause, ...] = (
         "vehicle arms in a calibration",
         ArmFault.CALIBRATION_FAILED,
         (calibrating.vehicle_arms,),
-        "does not apply; no calibration is begun",
+        "does not apply; no calibration is begun, and one that was given up goes on easing",
     ),
     Cause(
         "calibration finds no zeros",
@@ -278,8 +278,8 @@ Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.
 - An arm that may carry a vehicle whose motors idle or stand never opens. What goes wrong with it brings the motors up
   (TAKE_BACK), if the vehicle is ours; if it is not, the arm holds (HANG_HOLD) until a person has the motors carry it.
 - An arm above that is found or left HOLDING goes on to HANG_HOLD at once.
-- A calibration is on the ground, and nothing depends on the arm: it is given up for anything. The tendons go back to where
-  they were, the torque becomes what it was, and the zeros that were in force stay.
+- A calibration is on the ground, and nothing depends on the arm: it is given up for anything. The tendons go back to
+  where they were, the torque becomes what it was, and the zeros that were in force stay.
 - What is carried is never let go by itself: the arm holds, and a person decides. Only a load that is gone already
   ends the carrying, in HOLDING.
 

@@ -6,13 +6,18 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
-from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request
+from arm_companion.arm.tension import LoadCurve
+from arm_companion.config import Config
+from arm_companion.mission import calibrating
+from arm_companion.mission.course import Course
+from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request, Workshop
 from arm_companion.mission.glide import Glide
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import CALIBRATES, CARRYING, MOVES_VEHICLE, TIP, Anchor, Phase, Reach, Sharing, State
+from arm_companion.values import replace
 
 DT = 0.01
 T0 = 100.0
@@ -25,6 +30,10 @@ REACH = Reach((2.0, 0.0, -1.78), PLACE, (0.0, 0.0), False, 1.0, Glide.rest(PLACE
 HELD = CARRYING | SUSPENDED | {Phase.VERIFY, Phase.PERCHED, Phase.UNLOAD, Phase.RELEASE, Phase.HOLDING}
 """Phases in which the arm is around the bar, or around the object."""
 
+SETUP = calibrating.setup_of(Config(), Workshop((LoadCurve(150.0, 12.0, 0.1, 0.0, 5.0, 1.5, 0.02),) * 4, 1.5e-5))
+COURSE = Course((0.0,) * 4, held=True, goal=(0.0,) * 4, setup=SETUP)
+"""A calibration that has just been begun."""
+
 Change = Callable[[Facts], Facts]
 
 
@@ -36,7 +45,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "t": T0,
         "since": T0 - 0.1,
         "control": Control.EXTERNAL,
-        "armed": True,
+        "armed": phase not in CALIBRATES,
         "streaming": phase is not Phase.STARTUP,
         "reference": Reference(PLACE),
         "position": PLACE,
@@ -46,6 +55,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "reach": REACH if phase in TIP else None,
         "tension": (8.0, 4.0, 1.0, 4.0),
         "task": Order.GRASP if phase in CARRYING | {Phase.CLOSE} else Order.PERCH,
+        "course": {Phase.CALIBRATING: COURSE, Phase.EASING: replace(COURSE, goal=(-0.1,) * 4)}.get(phase),
         "bend": bend,
         "bend_goal": (0.0, 0.0) if phase is Phase.RELEASE else bend,
     }
@@ -119,15 +129,8 @@ class Run:
             assert norm(setpoint.velocity_w) <= fastest + 1e-9
             if state.phase not in MOVES_VEHICLE and facts.vehicle.control is Control.EXTERNAL:
                 assert setpoint.velocity_w == (0.0, 0.0, 0.0), "nobody asked the vehicle to move"
-        if state.phase in CALIBRATES:
-            assert commands.arm is not ArmAction.DRIVE, "where straight is, nobody knows"
-        else:
-            assert commands.arm is not ArmAction.LIMP, "a limp arm drops what it holds"
-            assert commands.arm is not ArmAction.WIND
+        check_calibration(state, facts, commands)
         assert (commands.pulls is not None) == (commands.arm in (ArmAction.DRIVE, ArmAction.WIND))
-        if state.phase is Phase.CALIBRATING:
-            assert not facts.vehicle.armed
-            assert facts.vehicle.landed
         if state.phase in {Phase.STARTUP, Phase.STOWED, Phase.HOLDING}:
             assert commands.arm is ArmAction.HOLD, "nothing moves until told"
         if commands.pulls is not None:
@@ -141,6 +144,18 @@ class Run:
         assert not commands.recover or state.phase in {Phase.STARTUP, Phase.STOWED}
         answered = [answer.request for answer in commands.answers]
         assert {request.id for request in facts.requests} <= set(answered), "every order is answered in its cycle"
+
+
+def check_calibration(state: State, facts: Facts, commands: Commands) -> None:
+    """Tendons are wound only in a calibration, and none goes on under a vehicle that may fly."""
+    if state.phase in CALIBRATES:
+        assert commands.arm is not ArmAction.DRIVE, "where straight is, nobody knows"
+    else:
+        assert commands.arm is not ArmAction.LIMP, "a limp arm drops what it holds"
+        assert commands.arm is not ArmAction.WIND, "slack is for calibrations"
+    if state.phase is Phase.CALIBRATING:
+        assert facts.vehicle.landed
+        assert not facts.vehicle.armed
 
 
 def check_load(before: State, state: State, facts: Facts, commands: Commands) -> None:

@@ -22,6 +22,7 @@ from arm_companion.mission.facts import (
     Control,
     Facts,
     Order,
+    Workshop,
     WrenchReport,
     WrenchSource,
 )
@@ -30,10 +31,11 @@ from arm_companion.mission.motion import Reference
 from arm_companion.mission.payload import Load, ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import CARRYING, Phase, Prediction, State
+from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction, State
 from arm_companion.mission.tendon_watch import TendonWatch
+from arm_companion.procedures.tendon_zeros import Zero
 from tests.unit.conftest import tendons
-from tests.unit.mission_rig import BENT, HELD, PLACE, T0, Change, Run, ask, memory, moved, tendon, vehicle
+from tests.unit.mission_rig import BENT, COURSE, HELD, PLACE, T0, Change, Run, ask, memory, moved, tendon, vehicle
 
 Hovering = Callable[..., Facts]
 
@@ -178,6 +180,15 @@ PROVOCATIONS: dict[str, Provocation] = {
     "set-points not followed": Provocation("does not follow", moved((-2.0, 0.0, 0.0)), seconds=1.2),
     "estimator jumps": Provocation("position jumped", moved((0.0, 1.0, 0.0)), quiet_s=0.05),
     "cycle overrun": Provocation("cycle is late", stall_s=0.4),
+    "vehicle arms in a calibration": Provocation("vehicle is armed", vehicle(armed=True)),
+    "calibration finds no zeros": Provocation(
+        "does not pull", recall=_remember(course=dataclasses.replace(COURSE, refusal="tendon 3 does not pull"))
+    ),
+    "calibration cannot be stored": Provocation(
+        "not stored",
+        lambda f: dataclasses.replace(f, workshop=Workshop((), 1.0, "no space left")),
+        _remember(course=dataclasses.replace(COURSE, zeros=(Zero(12, 0.001, 5.0, 30.0),))),
+    ),
     "daemon restarted in flight": Provocation("arm found", recall=_remember(control=Control.UNKNOWN)),
 }
 
@@ -247,6 +258,8 @@ def test_the_pilot_wins_in_the_same_cycle_in_every_phase(
 
 def quiet(hovering: Hovering, phase: Phase) -> Facts:
     """Facts of a phase in which nothing goes wrong."""
+    if phase in CALIBRATES:
+        return hovering(armed=False, landed=True)
     return hovering(BENT if phase in HELD else (0.0, 0.0))
 
 

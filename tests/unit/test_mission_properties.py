@@ -21,6 +21,7 @@ from arm_companion.mission.facts import (
     Result,
     SetpointKind,
     VehicleState,
+    Workshop,
 )
 from arm_companion.mission.hazards import vehicle_lost
 from arm_companion.mission.notices import WARNINGS
@@ -28,7 +29,7 @@ from arm_companion.mission.perch import TABLE
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.record_codec import dumps, loads
-from tests.unit.mission_rig import DT, Run, memory
+from tests.unit.mission_rig import DT, SETUP, Run, memory
 from tests.unit.test_perch_table import reachable
 
 Hovering = Callable[..., Facts]
@@ -125,6 +126,7 @@ class Happening:
             bar_age_s=0.1 if self.bar else math.inf,
             arm_setpoint=self.stream,
             ground_age_s=self.ground_age_s,
+            workshop=Workshop(SETUP.curves, SETUP.m_per_tick),
         )
 
 
