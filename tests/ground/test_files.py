@@ -133,6 +133,7 @@ def test_plot_draws_a_record_without_an_arm(
         (["params", "list", "X"], "params list"),
         (["perch", "--bar", "1", "2", "-3"], "belong together"),
         (["jog"], "needs a terminal"),
+        (["calibrate"], "--yes"),
     ],
 )
 def test_wrong_usage_ends_with_2_before_anything_is_opened(

@@ -111,6 +111,15 @@ def test_reach_sends_its_point(rig: Rig) -> None:
     assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_REACH, 0, 0.0, 3.0, -2.0, -1.5, *[0.0] * 3)]
 
 
+def test_a_calibration_wants_a_yes(rig: Rig) -> None:
+    rig.beat()
+    for words in ("calibrate", "calibrate no"):
+        rig.type(words)
+    assert rig.sent == []
+    rig.type("calibrate yes")
+    assert rig.sent == [(1, 192, mav.MAV_CMD_ARM_CALIBRATE, 0, 1.0, 1.0, *[0.0] * 5)]
+
+
 def test_what_gets_no_answer_is_repeated_and_then_told(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     rig.beat()
     rig.type("jog 90 45")
