@@ -31,7 +31,7 @@ _CODES: Final = """exit codes:
   130  ended by Ctrl-C before its end
 """
 
-_SURE: Final = """The arm takes up its tendons one by one for some four minutes, and bends by 60 degrees to each side.
+_SURE: Final = """The arm takes up its tendons one by one for some three minutes, and bends by 60 degrees to each side.
 It must hang straight down and free, nothing and nobody may touch it, and the propellers must not turn.
 The result is stored and used at once. Ctrl-C twice gives it up. Go on? [y/N] """
 
