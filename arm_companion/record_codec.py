@@ -1,6 +1,6 @@
 """Dataclasses <-> JSON text, exactly: floats keep every bit, and types come from annotations.
 
-They are plain ones, as `values` has them: no slots, no `__post_init__`.
+They are best plain ones, as `values` has them: no slots, no `__post_init__`. Others take longer.
 
 JSON has no numbers for what is not finite; these are the strings "nan", "inf" and "-inf", so that every reader of
 JSON takes the text.
@@ -119,6 +119,10 @@ def _summer(numbers: tuple[str, ...]) -> Callable[[Any], float]:
     return lambda value: sum(get(value))
 
 
+def _content(value: Any) -> dict[str, Any]:
+    return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+
+
 def _record_writer(cls: Any) -> Callable[[Any], Any]:
     """Much of a record is the very object of the cycle before, so what it became last is kept.
 
@@ -130,13 +134,14 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
     numbers = tuple(name for name, hint in kinds.items() if hint is float)
     sum_up = _summer(numbers)
     others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _writer(hint)) != _same]
+    slotted = hasattr(cls, "__slots__")  # calibrations, written once in a while
     last: tuple[Any, Any] = (None, None)
 
     def table_of(value: Any) -> Any:
         nonlocal last
         seen, table = last
         if value is not seen:
-            table = value.__dict__.copy()
+            table = _content(value) if slotted else value.__dict__.copy()
             for name in left_out:
                 del table[name]
             for name, write_field in others:
