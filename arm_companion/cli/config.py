@@ -6,9 +6,10 @@ import json
 import os
 from typing import Any
 
-from arm_companion.app import check_flyable, open_configured
+from arm_companion.app import open_configured
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.config.describe import Described, every, json_schema
+from arm_companion.config.flyable import check_flyable
 from arm_companion.config.layers import Layers, collect
 from arm_companion.config.load import checked
 from arm_companion.config.options import spelling

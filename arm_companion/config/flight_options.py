@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 from arm_companion.config.grasp_options import SimObjectConfig
+from arm_companion.config.gripper_options import SimGripperConfig
 from arm_companion.config.options import option, section
 
 
@@ -200,3 +201,4 @@ class SimConfig:
     operator_arm_url: str = option("where the operator hears the daemon", "udpin:127.0.0.1:14560")
     bar: SimBarConfig = section(SimBarConfig)
     object: SimObjectConfig = section(SimObjectConfig)
+    gripper: SimGripperConfig = section(SimGripperConfig)

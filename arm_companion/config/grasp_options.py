@@ -9,6 +9,11 @@ from arm_companion.config.options import option
 class GraspConfig:
     """[grasp] Picking an object up, carrying it and putting it down; reach and wrap are those of [perch]."""
 
+    kind: str = option(
+        "what holds the object: the arm, wrapped around it, or the gripper at its tip, from above",
+        "wrap",
+        choices=("wrap", "gripper"),
+    )
     object_position_m: tuple[float, ...] = option(
         "middle of the object's axis, world NED from the autopilot's origin, until a target message replaces it",
         (3.0, 0.0, -1.5),

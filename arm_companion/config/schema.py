@@ -26,6 +26,7 @@ from arm_companion.config.flight_options import (
     SimConfig,
 )
 from arm_companion.config.grasp_options import GraspConfig, SimObjectConfig
+from arm_companion.config.gripper_options import GripperConfig, SimGripperConfig, with_gripper
 from arm_companion.config.hang_options import HangConfig
 from arm_companion.config.link_options import STREAMED, LinkConfig, MavlinkConfig, VehicleConfig
 from arm_companion.config.mqtt_options import MqttConfig
@@ -44,6 +45,7 @@ __all__ = [
     "CalibrationConfig",
     "Config",
     "GraspConfig",
+    "GripperConfig",
     "HangConfig",
     "KeepOutConfig",
     "LimitsConfig",
@@ -60,6 +62,7 @@ __all__ = [
     "ServosConfig",
     "SimBarConfig",
     "SimConfig",
+    "SimGripperConfig",
     "SimObjectConfig",
     "VehicleConfig",
 ]
@@ -84,6 +87,7 @@ class Config:
     hang: HangConfig = section(HangConfig)
     grasp: GraspConfig = section(GraspConfig)
     reach: ReachConfig = section(ReachConfig)
+    gripper: GripperConfig = section(GripperConfig)
     rates: RatesConfig = section(RatesConfig)
     record: RecordConfig = section(RecordConfig)
     mqtt: MqttConfig = section(MqttConfig)
@@ -104,6 +108,26 @@ class Config:
             raise ConfigError("limits.keep_out.apex_m is at the centre of mass: the cone would have no direction")
         if sum(link.role == "autopilot" for link in self.links.values()) > 1:
             raise ConfigError("links: more than one link has the role autopilot")
+        with_gripper(self.servos, self.gripper_servo)
+        if self.gripper_by == "autopilot" and self.gripper.instance == self.vehicle.component_id:
+            raise ConfigError(
+                f"gripper.instance = {self.gripper.instance} is vehicle.component_id: DO_GRIPPER for it means ourselves"
+            )
+
+    @property
+    def gripper_by(self) -> str:
+        """Who moves the gripper's jaws; empty: the arm has no gripper."""
+        return self.gripper.by if self.grasp.kind == "gripper" else ""
+
+    @property
+    def gripper_servo(self) -> GripperConfig | None:
+        """The gripper that has a servo on the bus; None: there is none."""
+        return self.gripper if self.gripper_by == "servo" else None
+
+    @property
+    def bus_servos(self) -> ServosConfig:
+        """Every servo on the bus: the tendons' in their order, and then the gripper's."""
+        return with_gripper(self.servos, self.gripper_servo)
 
     def check_servos(self) -> None:
         """That every tendon has its servo, which only a flight needs.

@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm_companion.__main__ import main
-from arm_companion.app import check_flyable, open_configured
+from arm_companion.app import open_configured
 from arm_companion.arm.reaction import mount
 from arm_companion.config import document, load
 from arm_companion.config.describe import every, json_schema
+from arm_companion.config.flyable import check_flyable
 from arm_companion.config.layers import PREFIX, collect, files_of, shipped
 from arm_companion.config.options import spelling
 from arm_companion.config.schema import Config
