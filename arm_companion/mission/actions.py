@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from arm_companion.mission import calibrating, carry, reaching
+from arm_companion.mission import calibrating, carry, gripper, reaching
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
@@ -79,7 +79,9 @@ def prepare(s: Situation) -> State:
     if s.state.phase in CALIBRATES:
         return calibrating.prepare(s)
     state = _prepare(s)
-    return carry.prepare(s.remembering(state)) if s.grasping else state
+    if s.grasping:
+        state = carry.prepare(s.remembering(state))
+    return gripper.begin(s.remembering(state))
 
 
 def _prepare(s: Situation) -> State:
@@ -294,6 +296,8 @@ def _beside_bar(s: Situation) -> Vec3:
     way the arm meets the bar only when the wrap closes, which keeps the vehicle from bouncing off it.
     """
     state, perch = s.state, s.config.perch
+    if s.gripping:  # the straight arm has nothing to curl around
+        return state.contact_w
     share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
     closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
@@ -314,6 +318,8 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
     perch = s.config.perch
     if s.grasping and s.state.phase in _WITH_LOAD:
         return carry.goal(s)
+    if s.gripping and s.state.phase in (Phase.REACH, Phase.CONTACT):
+        return gripper.goal(s)
     anchor = s.state.anchor.position_w if s.state.anchor else s.facts.vehicle.position_w
     match s.state.phase:
         case Phase.APPROACH:

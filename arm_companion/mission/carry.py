@@ -6,6 +6,7 @@ import numpy as np
 
 from arm_companion.arm.model import Payload
 from arm_companion.arm.reaction import GRAVITY
+from arm_companion.mission import gripper
 from arm_companion.mission.facts import PayloadReport, Vec3
 from arm_companion.mission.grasp import LIGHT_SHARE, low
 from arm_companion.mission.motion import ZERO, add, norm, scale, sub
@@ -50,14 +51,19 @@ def track_load(s: Situation) -> Load:
         return interrupted(state.load)
     share = math.hypot(*state.bend) / s.config.perch.wrap_bend_rad
     lifted: float | None = None
-    if state.phase in _UNTOUCHED or (state.phase is Phase.CLOSE and share < _OPEN_SHARE):
+    if s.gripping and state.phase in (Phase.CONTACT, Phase.CLOSE):
+        lifted = None  # the tip may stand on the object
+    elif state.phase in _UNTOUCHED or (state.phase is Phase.CLOSE and share < _OPEN_SHARE):
         lifted = 0.0
     elif state.phase is Phase.CARRY and state.load.settled and not state.load.light_s:
         lifted = state.load.mass  # whatever the rotors need more from now on is the battery's fault
     lag = ROTOR_LAG_S + (_ARDUPILOT_LAG_S if s.config.vehicle.autopilot == "ardupilot" else 0.0)
     load = watch_load(state.load, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt, lifted=lifted, lag_s=lag)
     tightest = max(s.tensions, default=0.0)
-    share = _LOOSE_LIGHT_SHARE if tightest < _LOOSE_SHARE * load.grip else LIGHT_SHARE
+    loose = gripper.is_shut(s) if s.gripping else tightest < _LOOSE_SHARE * load.grip
+    share = _LOOSE_LIGHT_SHARE if loose else LIGHT_SHARE
+    if s.gripping and state.phase is Phase.PLACE and low(s):
+        share = _TOUCHING_SHARE  # what touches down is let go before the vehicle sways about it
     # before it is weighed, what the test lift found at least
     little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
     light = state.phase in CARRYING and load.now < little
@@ -72,8 +78,10 @@ def prepare(s: Situation) -> State:
     match state.phase:
         case Phase.APPROACH:  # from here on the way back is known, whatever comes
             return replace(state, contact_w=s.place(0.0))
+        case Phase.CONTACT if s.gripping:
+            return gripper.touching(s)
         case Phase.VERIFY:  # from here the object is lifted, and here it is set down again
-            place = state.position
+            place = gripper.lifted_from(s) if s.gripping else state.position
             anchor = Anchor(place, s.facts.vehicle.attitude_wb, state.tension)
             test = (0.0, 0.0, -s.config.grasp.verify_lift_m)
             reference = None if state.reference is None else replace(state.reference, position=place)
@@ -83,7 +91,8 @@ def prepare(s: Situation) -> State:
             return replace(state, offset=ZERO, load=load)
         case Phase.RELEASE if state.anchor is not None:  # of a closed arm, wherever that is: out as it came in
             closed = state.position  # where it rests on the object, and not where it was asked to sink to
-            contact = sub(closed, scale(s.straight_w, s.config.perch.contact_arc_m))
+            arc = 0.0 if s.gripping else s.config.perch.contact_arc_m
+            contact = sub(closed, scale(s.straight_w, arc))
             return replace(state, contact_w=contact, anchor=None)
     return state
 
@@ -91,7 +100,7 @@ def prepare(s: Situation) -> State:
 def settle(s: Situation) -> State:
     """Memory while a closed arm comes to rest on its object: the set-point follows the vehicle, so nothing winds up."""
     state = s.state
-    if state.phase is not Phase.VERIFY or s.elapsed >= _STEADY_S or state.anchor is None or not s.vehicle_fresh:
+    if state.phase is not Phase.VERIFY or s.elapsed >= _steady_s(s) or state.anchor is None or not s.vehicle_fresh:
         return state
     rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
     return replace(state, rest=rest, anchor=replace(state.anchor, position_w=rest))
@@ -101,9 +110,9 @@ def goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes with a load, and how fast."""
     grasp = s.config.grasp
     if s.state.phase is Phase.VERIFY:
-        if s.elapsed < _STEADY_S:
+        if s.elapsed < _steady_s(s):
             return s.rest, grasp.lift_speed_m_per_s
-        return add(s.rest, s.state.offset), _TEST_SHARE * grasp.lift_speed_m_per_s
+        return add(s.rest, s.state.offset), (1.0 if s.gripping else _TEST_SHARE) * grasp.lift_speed_m_per_s
     if s.state.phase is Phase.LIFT:
         return add(s.probe, (0.0, 0.0, -grasp.lift_height_m)), grasp.lift_speed_m_per_s
     if s.state.feedforward and s.state.reference is not None and _touching_down(s):
@@ -131,25 +140,35 @@ def push(s: Situation) -> Vec3:
     more than may be lifted.
     """
     load, grasp = s.state.load, s.config.grasp
-    if s.state.phase is Phase.VERIFY and s.elapsed < _STEADY_S:
+    if s.state.phase is Phase.VERIFY and s.elapsed < _steady_s(s):
         return ZERO  # it would lift the object before the vehicle is asked up
     if load.known and s.state.phase in (Phase.LIFT, Phase.CARRY):
         mass = load.mass
     elif math.isnan(load.now):
         mass = load.mass if load.known and s.state.phase in CARRYING else 0.0
     else:
-        mass = min(max(load.now, 0.0), load.mass if load.known and s.state.phase is Phase.PLACE else grasp.mass_max_kg)
+        most = load.mass if load.known and s.state.phase is Phase.PLACE else grasp.mass_max_kg
+        mass = min(max(load.now, _pluck(s), 0.0), most)
     # ArduPilot follows the acceleration that it measures, and so makes what is asked on any curve
     curve = None if s.config.vehicle.autopilot == "ardupilot" else load.curve
     gain = 1.0 if curve is None else curve.gain
     return (0.0, 0.0, -mass * GRAVITY / s.config.vehicle.mass_kg / gain)
 
 
+def _steady_s(s: Situation) -> float:
+    """How long a closed arm rests before the test lift. One whose tip alone is held does not: `gripper.pluck`."""
+    return 0.0 if s.gripping else _STEADY_S
+
+
+def _pluck(s: Situation) -> float:
+    return gripper.pluck(s) if s.gripping and s.state.phase is Phase.VERIFY else 0.0
+
+
 def payload(s: Situation) -> Payload | None:
     """What the arm carries, for the mechanics; None while it is not known.
 
     A closed arm is a circle around the object, so the object's middle is at its centre: one radius from the tip,
-    towards the side to which the arm is bent.
+    towards the side to which the arm is bent. A gripper has it between its jaws.
     """
     load = s.state.load
     if s.state.phase not in CARRYING or not load.known:
@@ -157,6 +176,8 @@ def payload(s: Situation) -> Payload | None:
     x, y = s.towards_bar_a
     coming_off = s.state.phase is Phase.PLACE and math.isfinite(load.now)
     mass = min(load.mass, load.now) if coming_off else load.mass
+    if s.gripping:
+        return Payload(max(mass, 0.0), np.array((0.0, 0.0, s.config.gripper.depth_m)))
     return Payload(max(mass, 0.0), _loop_radius(s) * np.array((x, y, 0.0)))
 
 
@@ -167,7 +188,10 @@ def report(s: Situation) -> PayloadReport | None:
         return None
     x, y = s.towards_bar_a
     R, radius = s.mount.rotation, _loop_radius(s)
-    centre = s.mount.position + R @ (radius * x, radius * y, 0.0)
+    place = (radius * x, radius * y, 0.0)
+    if s.gripping:
+        place = (0.0, 0.0, s.parameters.model.parameters.L + s.config.gripper.depth_m)
+    centre = s.mount.position + R @ place
     along, across, down = _GRIP_SIGMA
     spread = (math.hypot(along * x, across * y), math.hypot(along * y, across * x), down)
     sigma = [math.sqrt(sum((R[i, j] * spread[j]) ** 2 for j in range(3))) for i in range(3)]

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 from arm_companion.arm.tension import LoadCurve
+from arm_companion.mission.gripper_facts import GripperOrder, GripperState
 from arm_companion.procedures.tendon_zeros import Zero
 from arm_companion.record_codec import UNRECORDED
 
@@ -241,6 +242,7 @@ class ArmFlag(enum.IntFlag):
     TARGET_KNOWN = 256
     CONTACT = 512
     ANCHORED = 1024
+    GRIPPER_CLOSED = 16384
 
 
 class ArmFault(enum.IntFlag):
@@ -352,6 +354,7 @@ class Facts:
     ground_age_s: float = float("inf")  # since the newest heartbeat of a station that may command
     calibration: Calibration = Calibration()
     workshop: Workshop | None = None
+    gripper: GripperState | None = None  # None: the arm has none
 
 
 @dataclass(frozen=True)
@@ -380,3 +383,4 @@ class Commands:
     payload: PayloadReport | None = None
     # store them and take them into use; the notices of this cycle have them for the record
     zeros: tuple[Zero, ...] = field(default=(), compare=False, metadata=UNRECORDED)
+    gripper: GripperOrder | None = None  # where its jaws are to be; None: they stay as they are

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from arm_companion.mission import calibrating, grasp, hang, hazards, perch, pull_test, reach_table
+from arm_companion.mission import calibrating, grasp, gripper, hang, hazards, perch, pull_test, reach_table
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
@@ -142,6 +142,12 @@ CAUSES: tuple[Cause, ...] = (
     Cause("no contact in time", ArmFault.NO_CONTACT, (perch.no_contact,), "does not apply"),
     Cause("nothing below to set a load down on", ArmFault.NO_CONTACT, (grasp.nothing_below,), "does not apply"),
     Cause(
+        "gripper does not open",
+        ArmFault.GRIP_TEST_FAILED,
+        (gripper.does_not_open,),
+        "goes on; a RELEASE whose gripper stays closed ends by its time limit, and holds",
+    ),
+    Cause(
         "stiffness test failed",
         ArmFault.GRIP_TEST_FAILED,
         (pull_test.pull_test_failed, perch.no_grip, grasp.lift_failed, grasp.not_closed),
@@ -199,7 +205,7 @@ CAUSES: tuple[Cause, ...] = (
     Cause(
         "daemon restarted in flight",
         ArmFault.RESTARTED,
-        (perch.straight_at_start, perch.bent_at_start),
+        (perch.straight_at_start, perch.bent_at_start, gripper.holds_at_start),
         "does not apply: every start begins in STARTUP, and nothing moves until told",
     ),
     Cause("recorder's disk full", ArmFault.NONE, (), "nothing: counted, the record has a gap"),

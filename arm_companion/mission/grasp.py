@@ -6,6 +6,7 @@ when the rotors say that the load is off; or from HOLDING, when a person says so
 
 import math
 
+from arm_companion.mission import gripper
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
     astray,
@@ -38,6 +39,7 @@ _JUDGED_S = 6.0
 _LIFTED_M = 0.08
 _STILL_S = 2.0
 _NO_LEAN = 0.15  # m/s^2
+_DOWN = 0.98  # z of the arm's base axis in body axes, of an arm whose gripper comes from above
 
 _SINKING = frozenset({Phase.LIFT, Phase.PLACE})
 
@@ -59,8 +61,10 @@ def dropped(s: Situation) -> str | None:
 
 
 def not_closed(s: Situation) -> str | None:
-    """The arm is wrapped as far as allowed, yet no tendon carries the tension of a closed one."""
+    """The arm is wrapped as far as allowed, yet no tendon carries the tension of a closed one; or so the gripper."""
     perch = s.config.perch
+    if s.gripping:
+        return gripper.not_closed(s)
     if (
         not s.at_bend_goal
         or s.elapsed < perch.wrap_bend_rad / perch.bend_speed_rad_per_s + _SETTLE_S
@@ -103,7 +107,9 @@ def takes_too_long(s: Situation) -> str | None:
 
 
 def closed(s: Situation) -> str | None:
-    """Some tendon carries a closed arm's tension with the wrap complete."""
+    """Some tendon carries a closed arm's tension with the wrap complete; or the gripper holds something."""
+    if s.gripping:
+        return gripper.closed(s)
     most = max(s.state.tension)
     done = s.at_bend_goal and most >= s.config.grasp.grip_tension_n
     return f"closed with {most:.1f} N" if done else None
@@ -126,7 +132,9 @@ def lifted(s: Situation) -> str | None:
 def set_down(s: Situation) -> str | None:
     """The load is off; where the thrust is not known, the vehicle rests as low as where it took the object."""
     load = s.state.load
-    if load.light_s >= _SET_DOWN_S and norm(s.state.lean) < _NO_LEAN and (low(s) or not s.external):
+    # jaws that open let the rest of a push go upwards, away from the object; a wrapped arm would take it along
+    settled = s.gripping or norm(s.state.lean) < _NO_LEAN
+    if load.light_s >= _SET_DOWN_S and settled and (low(s) or not s.external):
         return "set down: the load is off"
     if math.isnan(load.now) and s.external and s.elapsed > _STILL_S and lowest(s):
         return "set down at the height of the pick-up; the thrust is not known"
@@ -156,8 +164,12 @@ def lowest(s: Situation) -> bool:
 
 def cannot_grasp(s: Situation) -> str | None:
     """Why a grasp cannot begin now."""
-    if (reason := cannot_set_out(s, s.object, "object")) is not None:
+    if s.config.gripper_by and s.mount.rotation[2, 2] < _DOWN:
+        return "the arm does not point down: a gripper takes what is below"
+    if (reason := cannot_set_out(s, s.object, "object", wraps=not s.config.gripper_by)) is not None:
         return reason
+    if s.config.gripper_by and not s.state.feedforward:
+        return "FEEDFORWARD is off: on a taut arm that is slow to take its load the vehicle sways; switch it on"
     if math.isnan(s.facts.vehicle.thrust):
         return "the autopilot does not tell its thrust (ATTITUDE_TARGET), so a load cannot be weighed"
     return None if s.state.load.calibrated else "the thrust of a hover is not known yet: hover for some seconds"
@@ -173,6 +185,16 @@ ORDERS: tuple[Ask, ...] = (
 )
 
 ABORTS: tuple[Row, ...] = (
+    Row(
+        frozenset({Phase.STARTUP}), gripper.holds_at_start, Phase.HOLDING, "gripper holds something", ArmFault.RESTARTED
+    ),
+    Row(
+        frozenset({Phase.APPROACH, Phase.REACH}),
+        gripper.does_not_open,
+        Phase.DEPART,
+        "gripper does not open",
+        ArmFault.GRIP_TEST_FAILED,
+    ),
     Row(frozenset({Phase.LIFT}), pilot_takes_over, Phase.CARRY, "pilot takes over", ArmFault.PILOT_TOOK_OVER),
     Row(
         frozenset({Phase.PLACE}),
@@ -190,6 +212,7 @@ ABORTS: tuple[Row, ...] = (
 )
 
 PROGRESS: tuple[Row, ...] = (
+    Row(frozenset({Phase.REACH}), gripper.at_object, Phase.CONTACT, "object between the jaws"),
     Row(frozenset({Phase.CLOSE}), closed, Phase.VERIFY, "closed"),
     *or_fail(Phase.CLOSE, not_closed, Phase.UNLOAD, "not closed", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.VERIFY}), lift_failed, Phase.UNLOAD, "test lift failed", ArmFault.GRIP_TEST_FAILED),

@@ -119,15 +119,15 @@ def hot(s: Situation) -> str | None:
     """A servo is close to the temperature at which it lets go."""
     if s.state.vigil.hot_s <= _DOUBTFUL_S:
         return None
-    i, most = max(enumerate(t.temperature for t in s.facts.tendons), key=lambda pair: pair[1])
-    return f"tendon {i + 1}: servo at {most:.0f} degC lets go at {s.config.servos.temperature_limit_c}"
+    name, hottest = max(s.servos, key=lambda pair: pair[1].temperature)
+    return f"{name}: servo at {hottest.temperature:.0f} degC lets go at {s.config.servos.temperature_limit_c}"
 
 
 def low_voltage(s: Situation) -> str | None:
     """The servos' supply is close to its limit."""
     if s.state.vigil.low_s <= _DOUBTFUL_S:
         return None
-    least = min(t.voltage for t in s.facts.tendons)
+    least = min(servo.voltage for _, servo in s.servos)
     return f"servo supply {least:.1f} V, least {s.config.servos.voltage_min_v:g} V"
 
 

@@ -2,7 +2,7 @@
 
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
-from arm_companion.mission import actions, calibrating, carry, reaching
+from arm_companion.mission import actions, calibrating, carry, gripper, reaching
 from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
 from arm_companion.mission.facts import (
     Answer,
@@ -90,6 +90,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         stiffness=prediction.stiffness,
         payload=carry.report(situation),
         zeros=zeros,
+        gripper=state.grip.order,
     )
     return state, commands
 
@@ -102,7 +103,7 @@ def _estimate(s: Situation) -> State:
     force = (
         observe_force(state.force, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt) if s.vehicle_fresh else state.force
     )
-    if state.phase is Phase.REACH:
+    if state.phase is Phase.REACH and not s.gripping:
         # the bar pushes the arm, and with it the vehicle, back
         force = time_above(tare(force, s.dt), (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
     return replace(
@@ -111,6 +112,7 @@ def _estimate(s: Situation) -> State:
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
         watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
         load=carry.track_load(s),
+        grip=gripper.watch(s),
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
         sharing=keep_sharing(s),
     )

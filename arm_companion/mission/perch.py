@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import calibrating, grasp, hang, jog, reach_table, tries
+from arm_companion.mission import calibrating, grasp, gripper, hang, jog, reach_table, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -92,7 +92,7 @@ def no_grip(s: Situation) -> str | None:
 
 def straight_at_start(s: Situation) -> str | None:
     """The daemon finds the arm straight or slack: nothing depends on it."""
-    if not s.facts.tendons or any(tendon.silent for tendon in s.facts.tendons):
+    if not s.heard:
         return None
     limp = not any(tendon.torque for tendon in s.facts.tendons)
     small = norm((*s.bend, 0.0)) < _ADOPT_BEND_RAD
@@ -101,7 +101,7 @@ def straight_at_start(s: Situation) -> str | None:
 
 def bent_at_start(s: Situation) -> str | None:
     """The daemon finds the arm bent under torque: someone depends on it, so it is left as it is."""
-    if not s.facts.tendons or any(tendon.silent for tendon in s.facts.tendons):
+    if not s.heard:
         return None
     return "arm found bent and holding; it is left as it is"
 
@@ -182,8 +182,8 @@ def unloaded(s: Situation) -> str | None:
 
 
 def unwrapped(s: Situation) -> str | None:
-    """The arm is straight enough to leave."""
-    ok = s.at_bend_goal and norm((*s.bend, 0.0)) < _CLEAR_BEND_RAD
+    """The arm is straight enough to leave, and its gripper open."""
+    ok = s.at_bend_goal and norm((*s.bend, 0.0)) < _CLEAR_BEND_RAD and gripper.is_open(s)
     return "arm clear of the bar" if ok else None
 
 

@@ -9,8 +9,8 @@ _WITHIN_M = 50.0
 _LEVEL = 0.2  # sine of the steepest axis that an upright vehicle can wrap
 
 
-def cannot_set_out(s: Situation, target: Bar, name: str) -> str | None:
-    """Why the way to `target`, called `name`, cannot begin; None when it can."""
+def cannot_set_out(s: Situation, target: Bar, name: str, *, wraps: bool = True) -> str | None:
+    """Why the way to `target`, called `name`, cannot begin, to wrap it or not; None when it can."""
     vehicle = s.facts.vehicle
     if (lost := vehicle_lost(s)) is not None:
         return lost
@@ -22,7 +22,7 @@ def cannot_set_out(s: Situation, target: Bar, name: str) -> str | None:
         return f"the {name} is {distance:.0f} m away; at most {_WITHIN_M:g} m are allowed"
     if abs(target.axis_w[2]) > _LEVEL:
         return f"the {name} is not level"
-    return hot(s) or low_voltage(s) or _wraps_into_keep_out(s)
+    return hot(s) or low_voltage(s) or (_wraps_into_keep_out(s) if wraps else None)
 
 
 def _wraps_into_keep_out(s: Situation) -> str | None:

@@ -2,7 +2,7 @@
 
 import math
 
-from arm_companion.mission import actions, hazards
+from arm_companion.mission import actions, gripper, hazards
 from arm_companion.mission.facts import ArmFault, ArmFlag, CalibrationState, Control, StatusReport
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.sharing import SHARING
@@ -52,9 +52,10 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
 def _flags(s: Situation) -> ArmFlag:
     """Facts that hold now."""
     vehicle, tendons, state = s.facts.vehicle, s.facts.tendons, s.state
+    servos = [servo for _, servo in s.servos]
     held = (
-        (ArmFlag.SERVOS_CONNECTED, bool(tendons) and not any(tendon.silent for tendon in tendons)),
-        (ArmFlag.TORQUE_ON, bool(tendons) and all(tendon.torque for tendon in tendons)),
+        (ArmFlag.SERVOS_CONNECTED, bool(tendons) and not any(servo.silent for servo in servos)),
+        (ArmFlag.TORQUE_ON, bool(tendons) and all(servo.torque for servo in servos)),
         (ArmFlag.CALIBRATED, s.facts.calibration.state is CalibrationState.VALID),
         (ArmFlag.VEHICLE_CONNECTED, vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s),
         (ArmFlag.VEHICLE_STATE_FRESH, s.vehicle_fresh),
@@ -67,6 +68,7 @@ def _flags(s: Situation) -> ArmFlag:
         (ArmFlag.TARGET_KNOWN, (s.facts.grasp_target if s.grasping else s.facts.bar) is not None),
         (ArmFlag.CONTACT, state.phase in _TOUCHES),
         (ArmFlag.ANCHORED, state.phase in (Phase.PERCHED, Phase.HANGING)),
+        (ArmFlag.GRIPPER_CLOSED, gripper.holds(s)),
     )
     return ArmFlag(sum(flag for flag, holds in held if holds))
 
@@ -74,20 +76,21 @@ def _flags(s: Situation) -> ArmFlag:
 def _present_faults(s: Situation) -> ArmFault:
     """Causes of failure that are there now, whether or not a row has acted on them."""
     vehicle, tendons = s.facts.vehicle, s.facts.tendons
+    servos = [servo for _, servo in s.servos]
     there = (
         (ArmFault.VEHICLE_LOST, vehicle.heartbeat_age_s > s.config.vehicle.heartbeat_timeout_s),
         (ArmFault.VEHICLE_STATE_STALE, not s.vehicle_fresh),
         (ArmFault.AUTOPILOT_FAILSAFE, vehicle.control is Control.FAILSAFE),
-        (ArmFault.SERVO_SILENT, any(tendon.silent for tendon in tendons)),
+        (ArmFault.SERVO_SILENT, any(servo.silent for servo in servos)),
         (ArmFault.ESTIMATOR_JUMP, hazards.estimator_jumped(s) is not None),
         (ArmFault.SETPOINT_REJECTED, hazards.astray(s) is not None),
         (ArmFault.GROUND_LOST, hazards.ground_lost(s) is not None),
         (ArmFault.OVERHEAT, hazards.hot(s) is not None),
-        (ArmFault.OVERLOAD, any(tendon.error_bits & _OVERLOAD for tendon in tendons)),
+        (ArmFault.OVERLOAD, any(servo.error_bits & _OVERLOAD for servo in servos)),
         (ArmFault.LOW_VOLTAGE, hazards.low_voltage(s) is not None),
         (ArmFault.MODEL, hazards.model_blind(s) is not None),
         (ArmFault.CYCLE_OVERRUN, hazards.overrun(s) is not None),
-        (ArmFault.SERVO_FAULT, any(tendon.error_bits or not tendon.homed for tendon in tendons)),
+        (ArmFault.SERVO_FAULT, any(servo.error_bits or not servo.homed for servo in servos)),
         (
             ArmFault.TENDON_SLACK,
             any(t.torque and t.tension + 2.0 * t.tension_sigma < s.config.limits.tension_min_n for t in tendons),

@@ -12,7 +12,8 @@ from arm_companion.arm.reaction import GRAVITY, mount
 from arm_companion.config.schema import Config
 from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
-from arm_companion.mission.facts import Bar, Control, Facts, Order, Vec3
+from arm_companion.mission.facts import Bar, Control, Facts, Order, TendonState, Vec3
+from arm_companion.mission.gripper_facts import JawState
 from arm_companion.mission.motion import ZERO, add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.values import replace
@@ -153,17 +154,35 @@ class Situation:
         return tuple(tendon.tension for tendon in self.facts.tendons)
 
     @property
+    def servos(self) -> tuple[tuple[str, TendonState | JawState], ...]:
+        """What moves every tendon and the gripper, with its name for people."""
+        tendons = tuple((f"tendon {i + 1}", tendon) for i, tendon in enumerate(self.facts.tendons))
+        return tendons if self.jaws is None else (*tendons, ("gripper", self.jaws))
+
+    @property
+    def jaws(self) -> JawState | None:
+        """The gripper that has a servo on the bus; None: there is none."""
+        return None if self.facts.gripper is None else self.facts.gripper.jaws
+
+    @property
+    def heard(self) -> bool:
+        """Whether every servo has been heard, and the autopilot where it moves the gripper."""
+        silent = not self.facts.tendons or any(servo.silent for _, servo in self.servos)
+        unknown = self.config.gripper_by == "autopilot" and self.facts.vehicle.heartbeat_age_s == math.inf
+        return not (silent or unknown)
+
+    @property
     def servo_fault(self) -> str | None:
         """The first servo fault in words."""
-        for i, tendon in enumerate(self.facts.tendons):
-            if tendon.error_bits:
-                return f"tendon {i + 1}: servo hardware error 0x{tendon.error_bits:02x}"
-            if tendon.silent:
-                return f"tendon {i + 1}: servo does not answer"
-            if not tendon.homed:
-                return f"tendon {i + 1}: servo lost its turns (arm straight? then CLEAR_ERRORS)"
-            if tendon.torque and not tendon.ready:
-                return f"tendon {i + 1}: servo does not follow goals"
+        for name, servo in self.servos:
+            if servo.error_bits:
+                return f"{name}: servo hardware error 0x{servo.error_bits:02x}"
+            if servo.silent:
+                return f"{name}: servo does not answer"
+            if not servo.homed:
+                return f"{name}: servo lost its turns (arm straight? then CLEAR_ERRORS)"
+            if servo.torque and not servo.ready:
+                return f"{name}: servo does not follow goals"
         return None
 
     @property
@@ -193,6 +212,11 @@ class Situation:
     def grasping(self) -> bool:
         """Whether an object is the target, and not a bar to perch on."""
         return self.state.task is Order.GRASP
+
+    @property
+    def gripping(self) -> bool:
+        """Whether the object is to be taken by the gripper, from above, and not by the arm around it."""
+        return self.grasping and bool(self.config.gripper_by)
 
     @property
     def bar(self) -> Bar:
@@ -236,10 +260,14 @@ class Situation:
     def place(self, before_contact: float) -> Vec3:
         """Vehicle position at which the straight arm is `before_contact` metres short of touching the bar.
 
-        The arm hangs so that the bar meets it at the configured arc length.
+        The arm hangs so that the bar meets it at the configured arc length. A gripper comes from above: from where
+        the object is between its jaws.
         """
         bar = self.bar
         perch = self.config.perch
+        if self.gripping:
+            down = self.parameters.model.parameters.L + self.config.gripper.depth_m + before_contact
+            return sub(sub(bar.point_w, scale(self.straight_w, down)), self.base_offset_w(self.state.heading))
         back = before_contact + bar.radius + perch.disk_radius_m
         base = sub(bar.point_w, scale(self.ahead, back))
         base = sub(base, scale(self.straight_w, perch.contact_arc_m))
@@ -250,7 +278,7 @@ class Situation:
         """Vehicle position at the stand-off: before the target, or before the place where an object was let go."""
         distance = self.config.perch.standoff_m
         if self.grasping and self.state.phase is Phase.DEPART:
-            return sub(self.state.contact_w, scale(self.ahead, distance))
+            return sub(self.state.contact_w, scale(self.straight_w if self.gripping else self.ahead, distance))
         return self.place(distance)
 
     @property

@@ -9,6 +9,7 @@ from arm_companion.mission.course import Course
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import ArmFault, Control, Order, Quaternion, StiffnessReport, Vec3, WrenchReport
 from arm_companion.mission.glide import Glide
+from arm_companion.mission.gripper_facts import NO_GRIP, Grip
 from arm_companion.mission.motion import ZERO, Reference
 from arm_companion.mission.payload import NO_LOAD, Load
 from arm_companion.mission.tendon_watch import Expected, TendonWatch
@@ -250,6 +251,7 @@ class State:
     watch: tuple[TendonWatch, ...] = ()  # of each tendon
     vigil: Vigil = Vigil()
     load: Load = NO_LOAD  # what the rotors lift beyond the vehicle
+    grip: Grip = NO_GRIP  # what the gripper was told, and does
     feedforward: bool = True  # switched on
     position: Vec3 = ZERO  # m, of the vehicle, smoothed: millimetres decide about newtons
     anchor: Anchor | None = None

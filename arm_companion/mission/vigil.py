@@ -2,7 +2,8 @@
 
 import math
 
-from arm_companion.mission.facts import Vec3
+from arm_companion.mission.facts import TendonState, Vec3
+from arm_companion.mission.gripper_facts import JawState
 from arm_companion.mission.motion import add, norm, scale, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import FOLLOWS, State
@@ -25,6 +26,9 @@ def keep_vigil(s: Situation) -> State:
     state, dt = s.state, s.dt
     limits, servos, tendons = s.config.limits, s.config.servos, s.facts.tendons
     heard = [tendon for tendon in tendons if not tendon.silent and math.isfinite(tendon.tension_sigma)]
+    answering: list[TendonState | JawState] = [*heard]
+    if s.jaws is not None and not s.jaws.silent:
+        answering.append(s.jaws)
 
     def time(before: float, *, holds: bool) -> float:
         return before + dt if holds else 0.0
@@ -35,8 +39,10 @@ def keep_vigil(s: Situation) -> State:
         position_w=s.facts.vehicle.position_w if s.vehicle_fresh else None,
         velocity_w=s.facts.vehicle.velocity_w,
         astray_s=time(before.astray_s, holds=_astray(s)),
-        hot_s=time(before.hot_s, holds=any(t.temperature > servos.temperature_limit_c - HEAT_MARGIN_K for t in heard)),
-        low_s=time(before.low_s, holds=any(t.voltage < servos.voltage_min_v + VOLTAGE_MARGIN_V for t in heard)),
+        hot_s=time(
+            before.hot_s, holds=any(t.temperature > servos.temperature_limit_c - HEAT_MARGIN_K for t in answering)
+        ),
+        low_s=time(before.low_s, holds=any(t.voltage < servos.voltage_min_v + VOLTAGE_MARGIN_V for t in answering)),
         slack_s=time(
             before.slack_s,
             holds=any(t.torque and t.tension + 2.0 * t.tension_sigma < limits.tension_min_n for t in heard),

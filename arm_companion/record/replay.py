@@ -253,9 +253,13 @@ class Runner:
 
 
 def differences(recorded: Any, now: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Path, recorded value and present value of everything that differs between two JSON values."""
+    """Path, recorded value and present value of everything that differs between two JSON values.
+
+    A record leaves nothing out: what it does not have did not exist when it was made, and is no difference while
+    nothing is asked by it.
+    """
     if isinstance(recorded, dict) and isinstance(now, dict):
-        for key in [*recorded, *(key for key in now if key not in recorded)]:
+        for key in [*recorded, *(key for key in now if key not in recorded and now[key] is not None)]:
             below = f"{path}.{key}" if path else key
             yield from differences(recorded.get(key, "(absent)"), now.get(key, "(absent)"), below)
     elif isinstance(recorded, list) and isinstance(now, list) and len(recorded) == len(now):

@@ -12,6 +12,7 @@ from arm_companion.mission import calibrating
 from arm_companion.mission.course import Course
 from arm_companion.mission.facts import ArmAction, Commands, Control, Facts, Order, Request, Workshop
 from arm_companion.mission.glide import Glide
+from arm_companion.mission.gripper_facts import GripperAction, GripperState, JawState
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
 from arm_companion.mission.sharing import SUSPENDED
@@ -96,6 +97,7 @@ class Run:
             self.phases.append(self.state.phase)
         self._check(before, facts, commands)
         check_load(before, self.state, facts, commands)
+        check_gripper(before, self.state, commands)
         return commands
 
     def cycles(self, facts: Facts, seconds: float) -> None:
@@ -167,6 +169,16 @@ def check_load(before: State, state: State, facts: Facts, commands: Commands) ->
         assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
 
 
+def check_gripper(before: State, state: State, commands: Commands) -> None:
+    """The gripper is told to open where nothing is held yet, and in RELEASE; nowhere else is it told anything new."""
+    order, last = commands.gripper, before.grip.order
+    if order == last or order is None:
+        assert order == last, "an order stands"
+        return
+    assert state.phase in {Phase.APPROACH, Phase.CLOSE, Phase.RELEASE}
+    assert (order.action is GripperAction.CLOSE) == (state.phase is Phase.CLOSE)
+
+
 def ask(facts: Facts, order: Order, *values: float, request: int = 7) -> Facts:
     """The same facts with one order."""
     return dataclasses.replace(facts, requests=(Request(request, order, values),))
@@ -186,6 +198,36 @@ def tendon(i: int, **fields: object) -> Change:
         return dataclasses.replace(facts, tendons=tuple(tendons))
 
     return change
+
+
+JAWS = JawState(
+    closed=0.0,
+    speed=0.0,
+    load=0.0,
+    temperature=30.0,
+    voltage=12.0,
+    error_bits=0,
+    silent=False,
+    torque=True,
+    ready=True,
+    homed=True,
+)
+
+
+def jaws(**fields: object) -> Change:
+    """Facts in which the arm has a gripper on a servo, quiet and open but for `fields`."""
+    return lambda facts: dataclasses.replace(facts, gripper=GripperState(dataclasses.replace(JAWS, **fields)))  # type: ignore[arg-type]
+
+
+def gripping(parameters: Parameters, **options: object) -> Parameters:
+    """The same parameters of an arm with a gripper."""
+    config = parameters.config
+    config = dataclasses.replace(
+        config,
+        grasp=dataclasses.replace(config.grasp, kind="gripper"),
+        gripper=dataclasses.replace(config.gripper, **options),  # type: ignore[arg-type]
+    )
+    return Parameters(config, parameters.model)
 
 
 def changed(facts: Facts, changes: Iterable[Change]) -> Facts:

@@ -27,6 +27,7 @@ from arm_companion.mission.facts import (
     WrenchSource,
 )
 from arm_companion.mission.failure_policy import CAUSES, SITUATIONS, Cause, document, reaction
+from arm_companion.mission.gripper_facts import Grip, GripperAction, GripperOrder
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.payload import Load, ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
@@ -35,7 +36,22 @@ from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction,
 from arm_companion.mission.tendon_watch import TendonWatch
 from arm_companion.procedures.tendon_zeros import Zero
 from tests.unit.conftest import tendons
-from tests.unit.mission_rig import BENT, COURSE, HELD, PLACE, T0, Change, Run, ask, memory, moved, tendon, vehicle
+from tests.unit.mission_rig import (
+    BENT,
+    COURSE,
+    HELD,
+    PLACE,
+    T0,
+    Change,
+    Run,
+    ask,
+    gripping,
+    jaws,
+    memory,
+    moved,
+    tendon,
+    vehicle,
+)
 
 Hovering = Callable[..., Facts]
 
@@ -69,6 +85,7 @@ class Provocation:
         quiet_s: of quiet hover before.
         blind: the mechanics have no solution.
         stall_s: length of the last cycle.
+        gripper: the arm has one, on a servo.
     """
 
     words: str
@@ -78,6 +95,7 @@ class Provocation:
     quiet_s: float = 0.0
     blind: bool = False
     stall_s: float = 0.01
+    gripper: bool = False
 
 
 def _remember(**fields: object) -> Callable[[State], State]:
@@ -168,6 +186,12 @@ PROVOCATIONS: dict[str, Provocation] = {
     "nothing below to set a load down on": Provocation("nothing found", moved((0.0, 0.0, DEEP)), _at_the_bottom),
     "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
+    "gripper does not open": Provocation(
+        "gripper did not open",
+        jaws(closed=0.6),
+        _remember(task=Order.GRASP, grip=Grip(GripperOrder(GripperAction.OPEN, T0 - 9.0))),
+        gripper=True,
+    ),
     "stiffness test failed": Provocation(
         "no grip|closed around nothing|pull test failed", moved((-0.04, 0.0, 0.0)), _pulled_off
     ),
@@ -207,6 +231,8 @@ def provoke(cause: Cause, phase: Phase, parameters: Parameters, facts: Facts) ->
     _slack.parameters = parameters.model.parameters  # type: ignore[attr-defined]
     if how.blind:
         parameters = Parameters(parameters.config, Blind(parameters.model.parameters))
+    if how.gripper:
+        parameters = gripping(parameters)
     run = Run(how.recall(memory(phase)), parameters)
     if how.quiet_s:
         run.cycles(facts, how.quiet_s)

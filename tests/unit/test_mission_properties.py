@@ -23,13 +23,14 @@ from arm_companion.mission.facts import (
     VehicleState,
     Workshop,
 )
+from arm_companion.mission.gripper_facts import GripperAnswer, GripperFate, GripperState, JawState
 from arm_companion.mission.hazards import vehicle_lost
 from arm_companion.mission.notices import WARNINGS
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.record_codec import dumps, loads
-from tests.unit.mission_rig import DT, SETUP, Run, memory
+from tests.unit.mission_rig import DT, SETUP, Run, gripping, memory
 from tests.unit.test_perch_table import reachable
 
 Hovering = Callable[..., Facts]
@@ -94,6 +95,25 @@ STREAMS = st.builds(
 )
 
 
+JAWS = st.builds(
+    JawState,
+    closed=st.sampled_from((0.0, 0.5, 0.98, -3.0)),
+    speed=st.sampled_from((0.0, 0.0, 1.0)),
+    load=st.sampled_from((0.0, 0.34, -0.5)),
+    temperature=st.sampled_from((30.0, 75.0)),
+    voltage=st.sampled_from((12.0, 5.0)),
+    error_bits=st.sampled_from((0, 0, 0x20)),
+    silent=st.booleans(),
+    torque=st.booleans(),
+    ready=st.booleans(),
+    homed=st.booleans(),
+)
+ANSWERS = st.builds(
+    GripperAnswer, at=st.floats(0.0, 200.0), fate=st.sampled_from(GripperFate), since_s=st.floats(0.0, 9.0)
+)
+GRIPPERS = st.one_of(st.none(), st.builds(GripperState, jaws=st.one_of(JAWS, st.none()), answer=ANSWERS))
+
+
 @dataclasses.dataclass(frozen=True)
 class Happening:
     """Some cycles with the same facts."""
@@ -105,6 +125,7 @@ class Happening:
     bar: Bar | None
     stream: ArmSetpoint | None
     ground_age_s: float
+    gripper: GripperState | None
     cycles: int
     dt: float
 
@@ -127,6 +148,7 @@ class Happening:
             arm_setpoint=self.stream,
             ground_age_s=self.ground_age_s,
             workshop=Workshop(SETUP.curves, SETUP.m_per_tick),
+            gripper=self.gripper,
         )
 
 
@@ -139,19 +161,24 @@ HAPPENINGS = st.builds(
     bar=st.one_of(st.none(), st.none(), BARS),
     stream=st.one_of(st.none(), st.none(), STREAMS),
     ground_age_s=st.sampled_from((0.5, 9.0, math.inf)),
+    gripper=GRIPPERS,
     cycles=st.integers(1, 40),
     dt=st.sampled_from((DT, DT, DT, 0.0, 0.05, 2.0)),
 )
 
 
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
-@given(start=st.sampled_from(Phase), happenings=st.lists(HAPPENINGS, min_size=8, max_size=16))
+@given(
+    start=st.sampled_from(Phase),
+    happenings=st.lists(HAPPENINGS, min_size=8, max_size=16),
+    gripper=st.sampled_from(("", "servo", "autopilot")),
+)
 def test_nothing_that_can_be_seen_or_ordered_makes_an_exception_or_an_illegal_command(
-    parameters: Parameters, hovering: Hovering, start: Phase, happenings: list[Happening]
+    parameters: Parameters, hovering: Hovering, start: Phase, happenings: list[Happening], gripper: str
 ) -> None:
     rates = dataclasses.replace(parameters.config.rates, wrench_hz=5.0)
     rare = Parameters(dataclasses.replace(parameters.config, rates=rates), parameters.model)
-    run = Run(memory(start), rare)
+    run = Run(memory(start), gripping(rare, by=gripper) if gripper else rare)
     ended: dict[int, Result] = {}
     for i, happening in enumerate(happenings):
         facts = happening.facts(hovering, 10 * i)

@@ -204,7 +204,9 @@ def test_a_cycle_that_this_version_does_not_know_is_refused(tmp_path: Path, caps
 
 
 def test_differences_name_the_field() -> None:
-    found = list(differences({"a": [1.0, 0.0], "b": {"c": "x"}}, {"a": [1.0, -0.0], "b": {"c": "y"}, "d": 1}))
+    found = list(
+        differences({"a": [1.0, 0.0], "b": {"c": "x"}}, {"a": [1.0, -0.0], "b": {"c": "y"}, "d": 1, "e": None})
+    )
     assert [path for path, _, _ in found] == ["a[1]", "b.c", "d"]
 
 
