@@ -11,12 +11,16 @@ from arm_companion.arm.model import ArmModel
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel, compiled_model
 from arm_companion.clock import Clock, Tick, ticks
+from arm_companion.config.flyable import check_flyable
+from arm_companion.config.gripper_options import with_gripper
 from arm_companion.config.schema import Config
 from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.component import Component
 from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.forwarding import Forwarding
+from arm_companion.drivers.gripper import gripper_of
+from arm_companion.drivers.gripper_servo import own_settings
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.mqtt_payloads import Health
@@ -30,7 +34,7 @@ from arm_companion.drivers.system_status import in_trouble, system_status
 from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
-from arm_companion.errors import ConfigError, DeviceFault
+from arm_companion.errors import DeviceFault
 from arm_companion.live.feed import Address
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
@@ -71,19 +75,6 @@ def open_configured(config: Config) -> Openers:
         {name: open_url(link.url) for name, link in config.links.items()},
         open_bus(config.servos.port, config.servos.baud),
     )
-
-
-def check_flyable(config: Config) -> None:
-    """Refuse what suits research and cannot be flown.
-
-    Raises:
-        ConfigError: no link to the autopilot, an arm of several segments, or servos that do not suit the tendons.
-    """
-    if not any(link.role == "autopilot" for link in config.links.values()):
-        raise ConfigError("links: none has the role autopilot")
-    if config.arm.segments:
-        raise ConfigError("arm.segments: the perch is flown by an arm of one segment")
-    config.check_servos()
 
 
 class Daemon:
@@ -146,12 +137,14 @@ class Daemon:
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
         self._bus = ServoBus(
             openers.servos,
-            self._calibrated.servos,
+            with_gripper(self._calibrated.servos, config.gripper_servo),
             parked=self._calibrated.parked,
             parked_window=config.calibration.turned_ticks,
+            own_settings=own_settings(config),
         )
         self._recalibration = Recalibration(config, self._calibrated, self._bus, self._rezero)
         self._tendons = self._calibrated.tendons(config)
+        self._gripper = gripper_of(config, autopilot_link, self._autopilot)
         self._state = State()
         self._bar: Bar | None = None
         self._rearm_at = 0.0
@@ -264,16 +257,17 @@ class Daemon:
             self._component.notify(Notice(Severity.WARNING, text))
 
     async def _observe(self) -> Facts:
-        servos = await self._bus.read()
+        every = await self._bus.read()
+        servos = every[: len(self._config.servos.ids)]  # the tendons'; a gripper's may be behind them
         now = self._clock.now()
-        if any(servo.tripped for servo in servos) and now >= self._rearm_at:
+        if any(servo.tripped for servo in every) and now >= self._rearm_at:
             self._rearm_at = now + _REARM_EVERY_S
             await self._rearm()
         ready = tuple(servo.ready for servo in servos)
         if any(now_ready and not before for now_ready, before in zip(ready, self._ready, strict=True)):
             self._tendons.rest()  # what follows again starts from where it is, at the tendons' own speed
         self._ready = ready
-        self._servo_telemetry.publish(now, servos, self._bus.counters)
+        self._servo_telemetry.publish(now, every, self._bus.counters)
         requests, bar = self._component.take()
         workshop = self._recalibration.facts(servos, requests, self._state.phase)
         self._bar = bar or self._bar
@@ -291,6 +285,7 @@ class Daemon:
             ground_age_s=self._component.access.ground_age_s,
             calibration=self._calibrated.judge(self._bus.info, servos),
             workshop=workshop,
+            gripper=self._gripper.state(every, now),
         )
 
     async def _rearm(self) -> None:
@@ -316,17 +311,20 @@ class Daemon:
     async def _act(self, commands: Commands, facts: Facts, now: float) -> None:
         """Servos first: they are what a late cycle hurts most."""
         self._last = commands
+        jaws = self._gripper.goals(commands.gripper, now)
         match commands.arm:
             case ArmAction.DRIVE if commands.pulls is not None:
-                await self._bus.write(self._tendons.goals(commands.pulls, now), torque=True)
+                await self._bus.write((*self._tendons.goals(commands.pulls, now), *jaws), torque=True)
             case ArmAction.WIND if commands.pulls is not None:
                 self._tendons.rest()
                 goals = self._recalibration.goals(commands.pulls, self._config.limits, now)
-                await self._bus.write(goals, torque=True)
+                await self._bus.write((*goals, *jaws), torque=True)
             case ArmAction.LIMP:
                 await self._recalibration.let_go()
             case _:
                 self._tendons.rest()
+                if any(goal is not None for goal in jaws):
+                    await self._bus.write((*[None] * len(facts.tendons), *jaws))
         if commands.zeros:
             self._recalibration.store(commands.zeros, self._clock.unix(now))
         if commands.recover and (self._recovering is None or self._recovering.done()):

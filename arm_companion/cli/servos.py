@@ -54,7 +54,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_common(setup)
     setup.add_argument(
-        "--id", type=_servo_id, help="id that it gets (default: the first of servos.ids that is missing)"
+        "--id",
+        type=_servo_id,
+        help="id that it gets (default: the first of servos.ids, then gripper.servo_id, that is missing)",
     )
     answer = setup.add_mutually_exclusive_group()
     answer.add_argument("--yes", action="store_true", help="write without asking")
@@ -73,9 +75,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run one of the commands."""
-    config = load_from(arguments).servos
-    port = arguments.port or config.port
-    config = dataclasses.replace(config, port=port)
+    whole = load_from(arguments)
+    port = arguments.port or whole.servos.port
+    config = dataclasses.replace(whole.bus_servos, port=port)
+    arguments.tendons = len(whole.servos.ids)
     bauds = list(getattr(arguments, "baud", None) or _bauds(config))
     try:
         with asyncio.Runner(loop_factory=precise_loop) as runner:
@@ -126,19 +129,20 @@ async def _scan(arguments: argparse.Namespace, config: ServosConfig, bauds: Sequ
     if arguments.json:
         print(json.dumps([dataclasses.asdict(servo) for servo in found]))
     else:
-        for line in _scan_lines(found, config):
+        for line in _scan_lines(found, config, arguments.tendons):
             print(line)
     placed = {servo.id for servo in found if servo.baud == config.baud and not servo.crowded}
     return 0 if placed >= set(config.ids) else _TROUBLE
 
 
-def _scan_lines(found: Sequence[FoundServo], config: ServosConfig) -> list[str]:
+def _scan_lines(found: Sequence[FoundServo], config: ServosConfig, tendons: int) -> list[str]:
     lines = []
+    names = [f"tendon {i + 1}" for i in range(tendons)] + ["gripper"] * (len(config.ids) - tendons)
     for servo in found:
         if servo.crowded:
             remark = "damaged answers: two servos with this id, or a bad line"
         elif servo.baud == config.baud and servo.id in config.ids:
-            remark = f"tendon {config.ids.index(servo.id) + 1}"
+            remark = names[config.ids.index(servo.id)]
         else:
             remark = "not one of the arm's: `servos setup`"
         lines.append(f"id {servo.id:>3} at {servo.baud:>7} bit/s   {servo.kind:<26} {remark}")
@@ -155,7 +159,7 @@ async def _setup(arguments: argparse.Namespace, config: ServosConfig, bauds: Seq
     open_at = _open_at(config)
     servo_provision.baud_code(config.baud)
     if arguments.id is not None and arguments.id not in config.ids:
-        raise CommandRejected(f"id {arguments.id} is not one of servos.ids {list(config.ids)}")
+        raise CommandRejected(f"id {arguments.id} is none of the arm's servos {list(config.ids)}")
     found = await servo_scan.scan(open_at, bauds, config.ids, _report)
     servo, servo_id = servo_provision.choose(found, config, arguments.id)
     plan = await servo_provision.make_plan(open_at, servo, servo_id, config)

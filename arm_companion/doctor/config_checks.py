@@ -34,7 +34,7 @@ def configuration(subject: Subject) -> Iterator[Outcome]:
         yield fail("an arm of several segments cannot be flown yet", "remove [[arm.segments]]")
     yield from _extras(config)
     yield from _keys(config)
-    yield ok(f"{config.vehicle.autopilot}, {len(config.links)} links, {len(config.servos.ids)} servos")
+    yield ok(f"{config.vehicle.autopilot}, {len(config.links)} links, {len(config.bus_servos.ids)} servos")
 
 
 def access(subject: Subject) -> Outcome:

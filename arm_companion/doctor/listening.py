@@ -118,10 +118,10 @@ async def listen_to_servos(config: Config, opener: Opener) -> ServosSeen:
     """What the servos answer. Nothing is written to them.
 
     Args:
-        config: its servos.
+        config: its servos, the gripper's too.
         opener: opens the bus.
     """
-    monitor = ServoMonitor(opener, config.servos)
+    monitor = ServoMonitor(opener, config.bus_servos)
     try:
         await monitor.open()
     except LinkError as error:

@@ -43,7 +43,7 @@ def settings_of(config: ServosConfig, speed_limit_rad_per_s: float = SPEED_LIMIT
 
 
 class ServoBus:
-    """All servos of the arm, in the tendons' order."""
+    """All servos of the arm: the tendons' in their order, and a gripper's behind them."""
 
     def __init__(
         self,
@@ -54,6 +54,7 @@ class ServoBus:
         rng: random.Random | None = None,
         parked: Mapping[int, int] | None = None,
         parked_window: int = 0,
+        own_settings: Mapping[int, Settings] | None = None,
     ) -> None:
         """Nothing is opened before `start` or `run`.
 
@@ -65,6 +66,7 @@ class ServoBus:
             parked: where servos last stood, ticks by id: one that lost its power is expected there, and elsewhere
                 at its zero.
             parked_window: ticks within which it must stand there.
+            own_settings: of servos, by id, that are set to something else than the others.
         """
         self._opener = opener
         self._config = config
@@ -74,7 +76,8 @@ class ServoBus:
         self._by_id = {record.id: record for record in self._records}
         self._parked, self._parked_window = dict(parked or {}), parked_window
         self._zeros = dict(zip(config.ids, config.zero_ticks, strict=True))
-        self._settings = settings_of(config, speed_limit_rad_per_s)
+        common = settings_of(config, speed_limit_rad_per_s)
+        self._settings = dict.fromkeys(config.ids, common) | dict(own_settings or {})
         self._reader = ServoReader(self._link, self._records, config, self._settings)
         self._transport: Transport | None = None
         self._opening = asyncio.Lock()
@@ -177,8 +180,9 @@ class ServoBus:
 
     async def _set_up(self, record: ServoRecord) -> None:
         async with self._setting_up:
-            info = await set_up(self._link, record, self._settings)
-            if record.id not in self.info:
+            settings = self._settings[record.id]
+            info = await set_up(self._link, record, settings)
+            if record.id not in self.info or (settings.within_a_turn and record.turns_lost):
                 await self._meet(record)
             self.info[record.id] = info
             record.set_up = True
@@ -189,7 +193,9 @@ class ServoBus:
         await self._reader.check_torque(self._records, deadline)
         at_rest = not any(other.torque for other in self._records if other is not record)
         near, window = self._zeros[record.id], self._config.home_window_ticks
-        if record.id in self._parked:
+        if self._settings[record.id].within_a_turn:
+            at_rest, window = True, ct.TICKS_PER_TURN // 2
+        elif record.id in self._parked:
             near, window = self._parked[record.id], self._parked_window
         await adopt(self._link, record, near, window if at_rest else -1)
 
@@ -220,11 +226,11 @@ class ServoBus:
         now = asyncio.get_running_loop().time()
         return tuple(record.state(now, self._config.silent_after) for record in self._records)
 
-    async def write(self, goals: Sequence[int] | None, *, torque: bool = False) -> None:
+    async def write(self, goals: Sequence[int | None] | None, *, torque: bool = False) -> None:
         """Send a goal to every servo that may move, in one frame.
 
         Args:
-            goals: ticks, in the servos' order; None repeats the last ones.
+            goals: ticks, in the servos' order; None, of all or of one, repeats the last ones.
             torque: switch the torque on first where it is off; the servo then starts from where it is.
 
         Raises:
@@ -233,14 +239,14 @@ class ServoBus:
         if goals is not None:
             if len(goals) != len(self._records):
                 raise ValueError(f"{len(goals)} goals for {len(self._records)} servos")
-            if any(abs(goal) > ct.EXTENDED_POSITION_LIMIT_TICKS for goal in goals):
+            if any(goal is not None and abs(goal) > ct.EXTENDED_POSITION_LIMIT_TICKS for goal in goals):
                 raise ValueError(f"goals {list(goals)} exceed +-{ct.EXTENDED_POSITION_LIMIT_TICKS} ticks")
         if torque:
             await self._torque_where_off()
         movable = [r for r in self._records if r.movable]
         if goals is not None:
             for record, goal in zip(self._records, goals, strict=True):
-                if record.movable:
+                if record.movable and goal is not None:
                     record.goal = goal
         await self._send_goals(movable)
 
@@ -336,7 +342,7 @@ class ServoBus:
 
     def renew_zeros(self, zero_ticks: Sequence[int]) -> None:
         """Expect servos that hang straight at other zeros from now on, ticks in the servos' order."""
-        self._zeros = dict(zip(self._config.ids, zero_ticks, strict=True))
+        self._zeros |= zip(self._config.ids, zero_ticks, strict=False)  # a gripper's servo, the last, has its own
 
     async def recover(self) -> None:
         """Bring back what can be brought back, at the word of somebody who sees the arm hang straight.

@@ -23,7 +23,7 @@ class ServoMonitor:
         self._config = config
         self._link = ServoLink(config.baud, config.reply_timeout_s)
         self._records = tuple(ServoRecord(servo, config.silent_after) for servo in config.ids)
-        self._reader = ServoReader(self._link, self._records, config, settings_of(config))
+        self._reader = ServoReader(self._link, self._records, config, dict.fromkeys(config.ids, settings_of(config)))
         self._transport: Transport | None = None
 
     async def open(self) -> None:

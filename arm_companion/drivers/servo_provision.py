@@ -86,7 +86,7 @@ def choose(found: Sequence[FoundServo], config: ServosConfig, wanted_id: int | N
     Args:
         found: all servos on the bus, at all speeds.
         config: of the arm.
-        wanted_id: one of `servos.ids`; None takes the first that nobody has.
+        wanted_id: one of `config.ids`; None takes the first that nobody has.
 
     Raises:
         CommandRejected: it is not clear which servo is meant, two have one id, or the id is taken.
@@ -102,7 +102,7 @@ def choose(found: Sequence[FoundServo], config: ServosConfig, wanted_id: int | N
     if wanted_id is None:
         missing = [servo for servo in config.ids if servo not in placed]
         if not missing:
-            raise CommandRejected("all of servos.ids answer: name the one to be looked after with --id")
+            raise CommandRejected("all of the arm's servos answer: name the one to be looked after with --id")
         wanted_id = missing[0]
     if len(new) > 1:
         others = ", ".join(f"id {s.id} at {s.baud} bit/s" for s in new)
@@ -130,7 +130,7 @@ async def make_plan(open_at: OpenAt, found: FoundServo, servo_id: int, config: S
     if found.firmware < ct.FIRST_FIRMWARE_WITH_WATCHDOG:
         raise CommandRejected(f"servo {found.id} has firmware {found.firmware} without bus watchdog: update it first")
     ends = (
-        (ct.ID, servo_id, "its place in servos.ids"),
+        (ct.ID, servo_id, "its place among the arm's servos"),
         (ct.BAUD_RATE, baud_code(config.baud), f"{config.baud} bit/s, servos.baud"),
     )
     async with link_at(open_at, found.baud) as link:

@@ -2,7 +2,7 @@
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import ServoRecord
@@ -30,9 +30,9 @@ class ServoReader:
     """Keeps the records of all servos up to date."""
 
     def __init__(
-        self, link: ServoLink, records: Sequence[ServoRecord], config: ServosConfig, settings: Settings
+        self, link: ServoLink, records: Sequence[ServoRecord], config: ServosConfig, settings: Mapping[int, Settings]
     ) -> None:
-        """Read through `link` into `records`; `settings` tell a servo that was set up from a fresh one."""
+        """Read through `link` into `records`; `settings`, by id, tell a servo that was set up from a fresh one."""
         self._link = link
         self._records = records
         self._timeout_s = config.reply_timeout_s
@@ -133,7 +133,8 @@ class ServoReader:
         record.missed = 1  # it belongs to the next Sync Read again
         ram = answers[record.id].parameters
         at = ct.PROFILE_VELOCITY.address - _RAM[0]
-        if ct.PROFILE_VELOCITY.decode(ram[at : at + ct.PROFILE_VELOCITY.size]) != self._settings.profile_velocity:
+        set_to = self._settings[record.id].profile_velocity
+        if ct.PROFILE_VELOCITY.decode(ram[at : at + ct.PROFILE_VELOCITY.size]) != set_to:
             record.lose_power()
             return True
         record.take_watchdog(tripped=ct.BUS_WATCHDOG.decode(ram[:1]) == ct.WATCHDOG_TRIPPED)

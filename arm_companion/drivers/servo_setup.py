@@ -15,17 +15,21 @@ _PING_SIZE = 3
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """What every servo is set to.
+    """What a servo is set to.
 
     Attributes:
         watchdog: raw value of the bus watchdog.
         profile_velocity: raw speed limit of the servo's own trajectory: the last bound on a wrong goal.
         profile_acceleration: raw acceleration limit of it, 0: none.
+        goal_pwm: raw limit of what it puts out; None: as it is after power-up, its own PWM limit.
+        within_a_turn: its travel is less than a turn, so that the angle of its horn says all.
     """
 
     watchdog: int
     profile_velocity: int
     profile_acceleration: int = 0
+    goal_pwm: int | None = None
+    within_a_turn: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +90,9 @@ async def set_up(link: ServoLink, record: ServoRecord, settings: Settings) -> Se
         await link.write(servo, ct.BUS_WATCHDOG, 0)
     if watchdog == ct.WATCHDOG_TRIPPED or not record.torque:
         await stay(link, record)
+    if settings.goal_pwm is not None:
+        most = await link.read(servo, ct.PWM_LIMIT)
+        await link.write(servo, ct.GOAL_PWM, min(settings.goal_pwm, most))
     await link.write(servo, ct.PROFILE_ACCELERATION, settings.profile_acceleration)
     await link.write(servo, ct.PROFILE_VELOCITY, settings.profile_velocity)
     await link.write(servo, ct.BUS_WATCHDOG, settings.watchdog)

@@ -14,6 +14,7 @@ import serial
 from arm_companion.__main__ import main
 from arm_companion.cli import servos as command
 from arm_companion.clock import SimulatedLoop, run_simulated
+from arm_companion.config import load
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.servo_monitor import ServoMonitor
@@ -38,18 +39,22 @@ class Bench:
     """A bus with emulated servos that commands open at any speed."""
 
     def __init__(self) -> None:
-        self.emulator = ServoEmulator(CONFIG, seed=8)
+        self.serve(CONFIG)
         self.opened: list[int] = []
         self.wires: list[EmulatedBus] = []
         self.fails_at: set[int] = set()
         self.on_open: Callable[[EmulatedBus], None] = lambda _: None
+
+    def serve(self, config: ServosConfig) -> None:
+        """Put the servos of another configuration on the bus."""
+        self.config, self.emulator = config, ServoEmulator(config, seed=8)
 
     def open_bus(self, port: str, baud: int) -> Opener:
         async def open_port(receiver: Receiver) -> Transport:
             if baud in self.fails_at:
                 raise LinkError(f"cannot open {port} at {baud} bit/s: not with this adapter")
             self.opened.append(baud)
-            wire = EmulatedBus(self.emulator, dataclasses.replace(CONFIG, baud=baud))
+            wire = EmulatedBus(self.emulator, dataclasses.replace(self.config, baud=baud))
             self.on_open(wire)
             pipe = MemoryPipe(latency_s=0.0001)
             tasks = [
@@ -114,6 +119,18 @@ def test_scan_is_well_when_all_answer_and_speaks_json(bench: Bench, capsys: pyte
     assert [servo["id"] for servo in found] == [1, 2, 3, 4]
     assert all(servo["firmware"] == 46 and not servo["crowded"] for servo in found)
     assert bench.opened == [1_000_000]
+
+
+def test_a_grippers_servo_is_found_and_set_up_like_the_others(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+    gripped = ["--config", "sim_gripper.toml", "--port", "/dev/ttyTEST"]
+    bench.serve(load("sim_gripper.toml").bus_servos)
+    new = bench.new(4)
+    assert main(["servos", "scan", "--baud", "1000000", *gripped]) == 1
+    assert "missing at 1000000 bit/s: 5" in capsys.readouterr().out
+    assert main(["servos", "setup", "--yes", *gripped]) == 0
+    assert (new.id, new.baud) == (5, 1_000_000)
+    assert main(["servos", "scan", "--baud", "1000000", *gripped]) == 0
+    assert "gripper" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_scan_sees_two_servos_with_one_id(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
@@ -200,7 +217,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
 def test_setup_refuses_what_is_not_clear(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
     before = [settings(servo) for servo in bench.emulator.servos]
     assert "name the one to be looked after" in refusal(capsys)
-    assert "id 9 is not one of servos.ids" in refusal(capsys, "--id", "9")
+    assert "id 9 is none of the arm's servos" in refusal(capsys, "--id", "9")
     assert [settings(servo) for servo in bench.emulator.servos] == before
     bench.new(2)
     assert "id 2 is taken already" in refusal(capsys, "--id", "2")
