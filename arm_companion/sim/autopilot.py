@@ -17,7 +17,7 @@ from arm_companion.config.schema import Config
 from arm_companion.errors import LinkError
 from arm_companion.protocol.dialect import mav
 from arm_companion.sim.ardupilot_control import ArdupilotController
-from arm_companion.sim.autopilot_commands import Commands
+from arm_companion.sim.autopilot_commands import Commands, GripperOutput
 from arm_companion.sim.autopilot_flavours import FLAVOURS, FORWARD, LINK_OPTIONS, TAKEOFF_ALTITUDE, Mode
 from arm_companion.sim.autopilot_modes import FlightModes
 from arm_companion.sim.autopilot_parameters import Parameters
@@ -73,7 +73,8 @@ class AutopilotStandIn:
         self._parameters = Parameters(defaults, bytewise=self._flavour.bytewise_parameters)
         self._modes = FlightModes(self._flavour, self._parameters, self._say)
         self._telemetry = Telemetry(self._flavour, self._modes, self._battery)
-        self._commands = Commands(self._flavour, self._modes, self._telemetry, self.reboot)
+        self.gripper = GripperOutput(config.gripper.instance)
+        self._commands = Commands(self._flavour, self._modes, self._telemetry, self.reboot, self.gripper)
         self._companion = Port("companion", StreamTable(self._flavour, self._flavour.companion_hz))
         self._ground = Port("ground", StreamTable(self._flavour, self._flavour.ground_hz))
         self._ports = (self._companion, self._ground)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from arm_companion.protocol.dialect import mav
@@ -15,6 +16,26 @@ Numbers = tuple[float, ...]
 _FORCE = 21196.0
 _ACCEPTED, _DENIED = mav.MAV_RESULT_ACCEPTED, mav.MAV_RESULT_DENIED
 _UNSUPPORTED = mav.MAV_RESULT_UNSUPPORTED
+_SILENT = -1
+
+
+@dataclass
+class GripperOutput:
+    """A gripper on the autopilot's output.
+
+    Attributes:
+        instance: param1 of DO_GRIPPER that means it.
+        closing: where it was told to go last.
+        result: that DO_GRIPPER gets; `silent` answers nothing.
+    """
+
+    instance: int = 1
+    closing: bool = False
+    result: int = int(_ACCEPTED)
+
+    def silent(self) -> None:
+        """Answer no DO_GRIPPER any more, and obey none."""
+        self.result = _SILENT
 
 
 class Commands:
@@ -25,13 +46,22 @@ class Commands:
         modes: arming and flight modes.
         telemetry: for messages that are asked for.
         reboot: power-cycles the autopilot.
+        gripper: on one of its outputs.
     """
 
-    def __init__(self, flavour: Flavour, modes: FlightModes, telemetry: Telemetry, reboot: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        flavour: Flavour,
+        modes: FlightModes,
+        telemetry: Telemetry,
+        reboot: Callable[[], None],
+        gripper: GripperOutput,
+    ) -> None:
         self._flavour = flavour
         self._modes = modes
         self._telemetry = telemetry
         self._reboot = reboot
+        self._gripper = gripper
         self._mode_of_number: dict[int, Mode] = {}
         for mode, number in flavour.modes.items():
             self._mode_of_number.setdefault(number, mode)
@@ -46,8 +76,7 @@ class Commands:
             mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
             mav.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._capabilities,
             mav.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._power,
-            # Measured: a gripper is acknowledged with nothing moving at all.
-            mav.MAV_CMD_DO_GRIPPER: lambda _p, _now, _port: int(_ACCEPTED),
+            mav.MAV_CMD_DO_GRIPPER: self._grip,
         }
         if flavour.is_px4:
             self._table[mav.MAV_CMD_DO_SET_ACTUATOR] = lambda _p, _now, _port: int(_ACCEPTED)
@@ -68,8 +97,7 @@ class Commands:
             acks.append(_ack(message, int(_ACCEPTED)))
         execute = self._table.get(message.command)
         result = int(_UNSUPPORTED) if execute is None else execute(numbers, now, port)
-        acks.append(_ack(message, result))
-        return acks
+        return [*acks, _ack(message, result)] if result != _SILENT else acks
 
     def set_mode(self, custom_mode: int, now: float) -> int:
         """The mode of that number, for DO_SET_MODE and the old SET_MODE."""
@@ -125,6 +153,13 @@ class Commands:
             return int(mav.MAV_RESULT_FAILED)
         port.send(answer)
         return int(_ACCEPTED)
+
+    def _grip(self, p: Numbers, _now: float, _port: Port) -> int:
+        """Measured: a gripper is acknowledged at once, also one that does not exist, with nothing moving at all."""
+        gripper = self._gripper
+        if p[0] == gripper.instance and gripper.result == _ACCEPTED:
+            gripper.closing = p[1] == mav.GRIPPER_ACTION_GRAB
+        return gripper.result
 
     def _capabilities(self, p: Numbers, now: float, port: Port) -> int:
         if p[0] != 1.0:

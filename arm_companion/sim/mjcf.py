@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from arm_companion.config.schema import ArmConfig, Config, MountConfig
+from arm_companion.sim.jaws import jaws_length, jaws_mass, jaws_xml
 
 NED_TO_UP = (1.0, -1.0, -1.0)  # diagonal of the half turn about x, its own inverse
 
@@ -97,7 +98,7 @@ def stand_height(config: Config) -> float:
     """Height in m of the centre of mass over the ground when standing: the skids keep the straight arm clear."""
     mount, arm = config.mount, config.arm
     down = _rotation(mount)[2][2]  # z of the body along z of the base
-    reach = mount.position_m[2] + max(0.0, down) * arm.length_m + config.perch.disk_radius_m
+    reach = mount.position_m[2] + max(0.0, down) * (arm.length_m + jaws_length(config)) + config.perch.disk_radius_m
     return max(_LEAST_LEG, reach + _GROUND_MARGIN)
 
 
@@ -244,7 +245,7 @@ def _arm(config: Config) -> str:
         last = i == arm.disks
         affinity = 0 if i <= _SHIELDED_LINKS else _AIRFRAME
         after = 0.0 if last else interval / 2
-        mass = arm.mass.end_disk_kg if last else arm.mass.disk_kg
+        mass = arm.mass.end_disk_kg - jaws_mass(config) if last else arm.mass.disk_kg
         middle = interval / 2  # height of the disk in its link
         lines += [
             f'<body name="{link(i)}" pos="0 0 {origin}">',
@@ -254,7 +255,7 @@ def _arm(config: Config) -> str:
             *_holes(arm, str(i), middle),
         ]
         origin = interval
-    lines.append(f'<site name="{TIP}" pos="0 0 {interval / 2}"/>')
+    lines += [f'<site name="{TIP}" pos="0 0 {interval / 2}"/>', *jaws_xml(config, interval / 2, _ARM, _AIRFRAME)]
     lines += ["</body>"] * arm.disks
     return _indent(lines, 8)
 

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from arm_companion.config.schema import Config
 from arm_companion.errors import ModelError
 from arm_companion.sim import mjcf
+from arm_companion.sim.jaws import Jaws
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
 
 # Rotor drag of a small quadrotor is near linear in the air speed: 2 m/s of wind push with 0.5 N.
@@ -65,6 +66,9 @@ class Plant:
         for i in range(config.arm.disks + 1):
             body = self._base if i == 0 else model.body(mjcf.link(i)).id
             self._link_of_geom[model.geom_bodyid == body] = i
+        self.jaws = Jaws(config, model, self._data) if config.gripper_by else None
+        if self.jaws is not None:  # they are a part of the end disk
+            self._link_of_geom[self.jaws.geoms] = config.arm.disks
         # bending and torsion hinges of every link: the torsion is the third, whichever bending axis comes first
         hinges = [i for i in range(model.njnt) if model.joint(i).name.startswith((mjcf.BENDING, mjcf.TORSION))]
         first, angle = hinges[0], model.jnt_qposadr[hinges[0]]

@@ -91,7 +91,7 @@ async def fly_simulated(
         servos.opener(1),
     )
     daemon = Daemon(config, openers, clock, ServiceManager(""), recorder, model=_model(config))
-    bus = EmulatedBus(plant.servos, config.servos)
+    bus = EmulatedBus(plant.servos, config.bus_servos)
     flight = Flight(samples=plant.samples)
     link = OperatorLink([ground.opener(1), arm.opener(1)])
     stop = asyncio.Event()
@@ -197,7 +197,7 @@ async def serve(config: Config, daemon_arguments: Sequence[str], log: Path, say:
 async def _in_real_time(world: World, config: Config) -> AsyncIterator[None]:
     """The world on its sockets and its pty, ready to be talked to."""
     sim = config.sim
-    bus = EmulatedBus(world.servos, config.servos)
+    bus = EmulatedBus(world.servos, config.bus_servos)
     ground: Opener = open_url(sim.operator_autopilot_url.replace("udpin:", "udpout:"))
     async with _running(
         world.run,

@@ -23,6 +23,7 @@ _STANDS_S = 8.0
 _STREAM_S = 3.0  # a heartbeat tells of the arming within a second, and PX4 wants a second of stream
 _FORCE = 21196.0  # param2 of a disarming that asks for no landing
 _CARRY_S = 4.0
+_TOLD_S = 0.3  # until a state that has just been left is not told any more
 _OFFBOARD = 6
 _GUIDED = 4
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
@@ -94,8 +95,12 @@ class Operator:
         return await self.fly(self._hang, self._disarm_and_arm, self.release)
 
     async def fly_grasp(self) -> str:
-        """An object is picked up twice, without and with the feed-forward, and put back each time."""
-        return await self.fly(self._grasp_uncompensated, self.ready, self._grasp)
+        """An object is picked up twice, without and with the feed-forward, and put back each time.
+
+        A gripper takes it with the feed-forward alone.
+        """
+        first = self._grasp if self.config.gripper_by else self._grasp_uncompensated
+        return await self.fly(first, self.ready, self._grasp)
 
     async def fly_grasp_once(self) -> str:
         """The same with the feed-forward alone, for trials."""
@@ -116,6 +121,7 @@ class Operator:
         except (ScenarioFailed, TimeoutError) as error:
             failure = str(error) or "the operator waited too long"
             self.say(f"failed: {failure}")
+            await asyncio.sleep(_TOLD_S)
         try:
             await self._come_home()
         except (ScenarioFailed, TimeoutError) as error:
@@ -256,7 +262,10 @@ class Operator:
         if self.state in ("READY", "TIP_HOLD"):
             await self.order(mav.MAV_CMD_ARM_STOW, "STOW", 30.0)
         self.say("landing")
-        await self._vehicle(mav.MAV_CMD_NAV_LAND, [0, 0, 0, float("nan"), float("nan"), float("nan"), 0], "landing")
+        if self.config.gripper_by:  # it hovers above the object
+            await self._vehicle(mav.MAV_CMD_NAV_RETURN_TO_LAUNCH, [], "return")
+        else:
+            await self._vehicle(mav.MAV_CMD_NAV_LAND, [0, 0, 0, float("nan"), float("nan"), float("nan"), 0], "landing")
         await self.wait(lambda: not self._armed(), 60.0, "the vehicle does not land and disarm")
 
     # --- small things ---

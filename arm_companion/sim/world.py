@@ -14,7 +14,9 @@ import numpy as np
 
 from arm_companion.clock import ticks
 from arm_companion.config.schema import Config
+from arm_companion.errors import ConfigError
 from arm_companion.sim.autopilot import AutopilotStandIn
+from arm_companion.sim.jaws import OutputDrive, ServoDrive
 from arm_companion.sim.plant import Plant, Pose
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
 from arm_companion.sim.servo_emulator import ServoEmulator
@@ -69,7 +71,12 @@ class World:
         self.wind = Wind(config.sim.wind_m_per_s, config.sim.gust_m_per_s, config.sim.seed)
         self.flown_by: FlightStack = flown_by or AutopilotStandIn(config, config.vehicle.autopilot)
         self._period_s = self.flown_by.period_s
-        self.servos = ServoEmulator(config.servos, config.sim.seed)
+        self.servos = ServoEmulator(config.bus_servos, config.sim.seed)
+        gripper = config.gripper_servo
+        self._horn = None if gripper is None else ServoDrive(gripper, config.sim.gripper.opening_m)
+        self._output = OutputDrive()
+        if config.gripper_by == "autopilot" and flown_by is not None:
+            raise ConfigError('gripper.by = "autopilot": only the stand-in has a gripper on its outputs')
         self.samples: list[Sample] = []
         self.events: list[tuple[float, Callable[[World], None]]] = []
         self.poses: list[Pose] = []
@@ -129,14 +136,33 @@ class World:
         tensions = self.plant.tensions()
         if coupling := config.servos.coupling:
             tensions = tuple((np.array(coupling).T @ tensions).tolist())
-        self.servos.advance(period, [radius * tension for tension in tensions])
+        self.servos.advance(period, [radius * tension for tension in tensions] + self._jaws_torque())
         pulls = [
             direction * (position - zero) / _TICKS_PER_RAD * radius
             for position, zero, direction in zip(
-                self.servos.positions(), config.servos.zero_ticks, config.servos.directions, strict=True
+                self.servos.positions()[: len(tensions)],
+                config.servos.zero_ticks,
+                config.servos.directions,
+                strict=True,
             )
         ]
+        self._drive_jaws()
         if coupling:
             pulls = (np.array(coupling) @ pulls).tolist()
         for _ in range(round(period / config.sim.step_s)):
             self.plant.step(rotors, pulls)
+
+    def _jaws_torque(self) -> list[float]:
+        """What the jaws put on the horn of their servo, N m; nothing when they have none."""
+        jaws = self.plant.jaws
+        return [] if jaws is None or self._horn is None else [self._horn.torque(jaws.force)]
+
+    def _drive_jaws(self) -> None:
+        jaws = self.plant.jaws
+        if jaws is None:
+            return
+        if self._horn is not None:
+            jaws.drive(self._horn.closed(self.servos.positions()[-1]))
+        else:
+            closing = self.autopilot.gripper.closing
+            jaws.drive(self._output.advance(closing=closing, force=jaws.force, dt=self._period_s))

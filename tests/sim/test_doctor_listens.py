@@ -13,6 +13,7 @@ import pytest
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, precise_loop, run_simulated
 from arm_companion.config import Config, load
 from arm_companion.config.schema import LinkConfig
+from arm_companion.doctor.arm_checks import servos as check_servos
 from arm_companion.doctor.check import Level, examine
 from arm_companion.doctor.listening import listen_to_servos, listen_to_vehicle
 from arm_companion.doctor.subject import ServosSeen, Subject, VehicleSeen
@@ -89,14 +90,15 @@ def test_a_link_that_cannot_be_opened_is_the_finding() -> None:
     assert run_simulated(main()).error == "cannot open /dev/ttyX: no such device"
 
 
-def servos_seen() -> ServosSeen:
+def servos_seen(known: Config, prepare: Callable[[ServoEmulator], None] = lambda _: None) -> ServosSeen:
     async def main() -> ServosSeen:
-        emulator = ServoEmulator(Config().servos, seed=3)
-        pipe, bus = MemoryPipe(latency_s=0.0001), EmulatedBus(emulator, Config().servos)
+        emulator = ServoEmulator(known.bus_servos, seed=3)
+        prepare(emulator)
+        pipe, bus = MemoryPipe(latency_s=0.0001), EmulatedBus(emulator, known.bus_servos)
         tasks = [asyncio.create_task(bus.serve_memory(pipe.opener(0))), asyncio.create_task(keep_time(emulator))]
         await bus.wait_ready()
         try:
-            return await listen_to_servos(Config(), pipe.opener(1))
+            return await listen_to_servos(known, pipe.opener(1))
         finally:
             for task in tasks:
                 task.cancel()
@@ -106,11 +108,22 @@ def servos_seen() -> ServosSeen:
 
 
 def test_servos_are_heard() -> None:
-    seen = servos_seen()
+    seen = servos_seen(Config())
     assert [servo.id for servo in seen.servos if not servo.silent] == [1, 2, 3, 4]
     assert all(servo.voltage > 9.0 for servo in seen.servos)
     assert seen.answers > 100
     assert 0 not in seen.firmware
+
+
+def test_a_grippers_servo_is_one_of_them(tmp_path: Path) -> None:
+    known = load("sim_gripper.toml")
+    assert [servo.id for servo in servos_seen(known).servos if not servo.silent] == [1, 2, 3, 4, 5]
+
+    def silence(emulator: ServoEmulator) -> None:
+        emulator[5].silenced = True
+
+    found = list(check_servos(Subject(machine(tmp_path), known, servos=servos_seen(known, silence))))
+    assert found[0].found == "servo 5 is silent"
 
 
 def test_a_bus_that_cannot_be_opened_is_the_finding() -> None:
