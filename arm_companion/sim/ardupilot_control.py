@@ -51,6 +51,7 @@ _ERROR_CUTOFF_HZ = 5.0  # PSC_VELXY_FLTE and _FLTD
 _THRUST_PER_ACCELERATION = 0.1  # PSC_ACCZ_P over the hover throttle of 0.5: share of hover thrust for 1 m/s^2
 _THRUST_INTEGRAL = 0.2  # 1/s, PSC_ACCZ_I over the same
 _ACCELERATION_CUTOFF_HZ = 20.0  # PSC_ACCZ_FLTE
+_RELEASED = 0.999  # of the climb speed, from which on the take-off has begun
 _THROTTLE_CUTOFF_HZ = 2.0  # POSCONTROL_THROTTLE_CUTOFF_FREQ_HZ, a constant
 
 
@@ -139,6 +140,9 @@ class ArdupilotController(FlightController):
                 path.place, path.speed, path.acceleration = estimate.position_w[i], estimate.velocity_w[i], 0.0
                 continue
             path.bend(goal, speed or 0.0, forward or 0.0, gains, dt)
+            if i == 2 and climb < _RELEASED * self.gains.speed_up:  # not lifted off yet: its path begins there
+                path.place, path.speed, path.acceleration = estimate.position_w[i], 0.0, 0.0
+                loops.vertical = _Vertical()
             close = square_root_control(path.place - estimate.position_w[i], gains.position, gains.accelerate)
             target = path.speed + clamp(close, -gains.speed, gains.speed)
             if i == 2:
