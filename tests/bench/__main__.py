@@ -10,6 +10,7 @@ import json
 import sys
 from pathlib import Path
 
+from tests.bench.daemon import daemon
 from tests.bench.listening import listening
 from tests.bench.measure import Result
 from tests.bench.mechanics import mechanics
@@ -25,7 +26,7 @@ def main() -> None:
     arguments = parser.parse_args()
     results: list[Result] = []
     _say(f"{'':<44}{'ours':>11} {'unit':<6}{'peer':>11}  {'ratio':>8}  beside")
-    for part in (mechanics, protocols, replaying, servo_cycle, lambda _: listening()):
+    for part in (mechanics, protocols, replaying, servo_cycle, lambda _: listening(), daemon):
         for result in part(arguments.rounds):
             results.append(result)
             _say(result.line())

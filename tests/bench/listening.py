@@ -11,7 +11,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec
@@ -33,9 +33,7 @@ def listening() -> Iterator[Result]:
 
 
 def _measure(name: str) -> float:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     command = [sys.executable, "-m", "tests.bench.listening", name, str(port)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "MAVLINK20": "1"}) as listener:
         _send(port, listener)
@@ -47,15 +45,32 @@ def _measure(name: str) -> float:
     return float(heard["cpu"]) / float(heard["wall"])
 
 
+def free_port() -> int:
+    """A UDP port of loopback that nobody has."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
 def _send(port: int, listener: "subprocess.Popen[bytes]") -> None:
     """What an autopilot streams, until the listener has had enough."""
+    begun = time.perf_counter()
+
+    def wanted() -> bool:
+        if time.perf_counter() - begun > SECONDS + WARM_UP_S + 15.0:
+            listener.kill()
+            raise RuntimeError("the listener does not end")
+        return listener.poll() is None
+
+    stream(port, wanted)
+
+
+def stream(port: int, wanted: Callable[[], bool]) -> None:
+    """500 messages a second to a port, as long as they are wanted."""
     codec = MavlinkCodec(1, 1)
     begun, tick = time.perf_counter(), 0
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-        while listener.poll() is None:
-            if time.perf_counter() - begun > SECONDS + WARM_UP_S + 15.0:
-                listener.kill()
-                raise RuntimeError("the listener does not end")
+        while wanted():
             for message in _messages(tick):
                 out.sendto(codec.encode(message), ("127.0.0.1", port))
             tick += 1

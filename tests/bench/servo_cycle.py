@@ -36,7 +36,7 @@ def servo_cycle(rounds: int) -> Iterator[Result]:
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
     bare: list[float] = []
-    with _port() as path:
+    with port() as path:
         for _ in range(rounds):
             ours.append(_ours(path))
             theirs.append(_theirs(path))
@@ -59,7 +59,8 @@ def wire_s() -> float:
 
 
 @contextlib.contextmanager
-def _port() -> Iterator[Path]:
+def port() -> Iterator[Path]:
+    """Where four emulated servos are."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "servos"
         command = [sys.executable, "-m", "tests.bench.servo_port", str(path)]
