@@ -39,6 +39,7 @@ GROUPS: Final = {
     "sim perch --sitl": "tests/sitl: a flight stack must be named",
     "sim perch --simulated --video": "tests/sim/test_film.py: off-screen OpenGL is not everywhere",
     "sim world": "tests/sim/test_documented_commands.py: with what is typed beside it",
+    "ground calibrate": "tests/ground/test_calibrate.py: a person must confirm",
     "calibrate tendons": "tests/sim/test_calibrate_tendons.py: a person must answer",
     "calibrate tension": "tests/unit/test_servo_tools.py: weights must be hung",
     "jog ": "tests/unit/test_jog.py: a keyboard must be there",

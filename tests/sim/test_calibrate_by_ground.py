@@ -26,6 +26,7 @@ REJECTED = mav.MAV_RESULT_TEMPORARILY_REJECTED
 CANCELLED = mav.MAV_RESULT_CANCELLED
 
 
+@pytest.mark.scenario
 def test_the_ground_station_calibrates_and_the_arm_is_ready_with_the_zeros_that_it_found(tmp_path: Path) -> None:
     """Zeros to 2 mm, tightness of opposite tendons to 0.25 mm: what the command on the bench must reach, too."""
     arm = OnTheGround(tmp_path, "calibration.tendons=required")
@@ -184,6 +185,7 @@ def test_the_same_command_again_does_nothing_twice(tmp_path: Path) -> None:
     assert sum("STOWED -> CALIBRATING" in n.text for r in arm.recorder.records for n in r.commands.notices) == 1
 
 
+@pytest.mark.scenario
 def test_a_read_only_disk_leaves_the_zeros_that_were_in_force(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(path: Path, _: object) -> None:
         raise OSError(errno.EROFS, "Read-only file system", str(path))
