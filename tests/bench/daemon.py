@@ -35,6 +35,10 @@ READY_S = 20.0
 LATEST = 0.99
 
 
+class NotReady(Exception):
+    """Nothing could be measured."""
+
+
 @dataclasses.dataclass
 class Taken:
     """Of one flight on the bench: seconds of each cycle, and shares."""
@@ -52,8 +56,12 @@ def daemon(_: int) -> Iterator[Result]:
     """The budgets of the design, at its two rates, and what a record costs."""
     bare = {rate: _bare(rate) for rate in (100.0, 200.0)}
     for rate, recorded in ((100.0, False), (200.0, False), (200.0, True)):
-        taken = _measure(rate, recorded=recorded)
         what = f"daemon, {rate:.0f} Hz, 500 messages/s{', recorded' if recorded else ''}"
+        try:
+            taken = _measure(rate, recorded=recorded)
+        except NotReady as reason:  # the machine stalled, and the emulated servos fell behind
+            sys.stderr.write(f"{what}: not measured, {reason}\n")
+            continue
         yield Result(f"{what}: of a core", 100.0 * taken.cpu, "%", "a bare event loop", 100.0 * bare[rate].cpu)
         late = 1e3 * bare[rate].p99(bare[rate].late)
         yield Result(f"{what}: start late, p99", 1e3 * taken.p99(taken.late), "ms", "a bare event loop", late)
@@ -79,7 +87,7 @@ def _measure(rate: float, *, recorded: bool) -> Taken:
 async def _fly(rate: float, servos: Path, udp: int, folder: Path | None) -> Taken:
     settings = [f"rates.cycle_hz={rate}", "vehicle.system_id=1", "calibration.directory=''"]
     if folder is not None:
-        settings += ["record.enabled=true", f"record.directory='{folder}'"]
+        settings += [f"record.directory='{folder}'", "record.raw=true"]
     config = load("sim.toml", settings)
     (name,) = (name for name, link in config.links.items() if link.role == "autopilot")
     config = dataclasses.replace(config, links={name: config.links[name]})
@@ -153,7 +161,7 @@ class Probe:
 
 def _in_time(begun: float) -> None:
     if time.perf_counter() - begun > READY_S:
-        raise RuntimeError("the arm does not become ready")
+        raise NotReady("the arm does not become ready")
 
 
 def lateness(starts: list[float], period: float) -> list[float]:
