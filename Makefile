@@ -32,7 +32,8 @@ test: $(STAMP)  ## run the tests: what has its own time on all cores, then what 
 	@$(BIN)/python -m pytest -m 'realtime and $(SHORT)'
 
 scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and install the Debian package
-	@$(BIN)/python -m pytest -n auto --dist load -m scenario
+	@$(BIN)/python -m pytest -n auto --dist load -m 'scenario and not realtime'
+	@$(BIN)/python -m pytest -m 'scenario and realtime'
 
 sitl: $(STAMP)  ## fly the real flight stacks that ARM_COMPANION_ARDUPILOT_SITL and ARM_COMPANION_PX4_SITL name
 	@test -n "$$ARM_COMPANION_ARDUPILOT_SITL$$ARM_COMPANION_PX4_SITL" || \

@@ -185,6 +185,7 @@ def test_a_reader_with_a_vision_process(place: Path) -> None:
 
 
 @pytest.mark.scenario
+@pytest.mark.realtime
 @pytest.mark.parametrize("line", lines(BEGIN), ids=lambda line: line[:60])
 def test_it_begins_and_ends_when_told(line: str, place: Path) -> None:
     words = command(line)
