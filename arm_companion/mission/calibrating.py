@@ -49,9 +49,9 @@ def vehicle_arms(s: Situation) -> str | None:
 
 def vehicle_silent(s: Situation) -> str | None:
     """Nobody knows whether the vehicle is armed; where it is does not matter."""
-    age, limit = s.facts.vehicle.heartbeat_age_s, s.config.vehicle.heartbeat_timeout_s
-    if age <= limit:
+    if s.vehicle_heard:
         return None
+    age = s.facts.vehicle.heartbeat_age_s
     if math.isinf(age):
         return "the autopilot has not been heard"
     return f"the autopilot is silent, heartbeat {age:.1f} s old"

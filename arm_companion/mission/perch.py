@@ -138,8 +138,7 @@ def ready_to_try_again(s: Situation) -> str | None:
     """Back at the stand-off after a try that came to nothing, the order still open, and nothing against another."""
     if not tries.setting_out(s) or at_standoff(s) is None:
         return None
-    grasping = s.grasping
-    against = grasp.cannot_grasp(s) if grasping else cannot_perch(s)
+    against = grasp.cannot_grasp(s) if s.grasping else cannot_perch(s)
     return "at the stand-off for another try" if against is None else None
 
 

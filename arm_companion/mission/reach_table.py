@@ -23,6 +23,9 @@ from arm_companion.mission.state import TIP, Phase
 Row = Transition[Phase, Situation]
 Ask = OrderRow[Phase, Situation]
 
+_JUDGED_S = 1.0
+_LEFT = 2.0
+
 
 def taken_over(s: Situation) -> str | None:
     """The autopilot left our mode in this cycle; who flies by hand from the start is left to it."""
@@ -47,10 +50,6 @@ def left_point(s: Situation) -> str | None:
     if reach is None or s.elapsed < _JUDGED_S or reach.error_m <= _LEFT * s.config.reach.tolerance_m:
         return None
     return tip_error(s)
-
-
-_JUDGED_S = 1.0
-_LEFT = 2.0
 
 
 def cannot_reach(s: Situation) -> str | None:

@@ -51,13 +51,13 @@ def status_report(s: Situation, prediction: Prediction) -> StatusReport:
 
 def _flags(s: Situation) -> ArmFlag:
     """Facts that hold now."""
-    vehicle, tendons, state = s.facts.vehicle, s.facts.tendons, s.state
+    tendons, state = s.facts.tendons, s.state
     servos = [servo for _, servo in s.servos]
     held = (
         (ArmFlag.SERVOS_CONNECTED, bool(tendons) and not any(servo.silent for servo in servos)),
         (ArmFlag.TORQUE_ON, bool(tendons) and all(servo.torque for servo in servos)),
         (ArmFlag.CALIBRATED, s.facts.calibration.state is CalibrationState.VALID),
-        (ArmFlag.VEHICLE_CONNECTED, vehicle.heartbeat_age_s <= s.config.vehicle.heartbeat_timeout_s),
+        (ArmFlag.VEHICLE_CONNECTED, s.vehicle_heard),
         (ArmFlag.VEHICLE_STATE_FRESH, s.vehicle_fresh),
         (ArmFlag.EXTERNAL_CONTROL, s.external),
         (ArmFlag.SETPOINTS_SENT, actions.setpoint(s) is not None),
@@ -78,7 +78,7 @@ def _present_faults(s: Situation) -> ArmFault:
     vehicle, tendons = s.facts.vehicle, s.facts.tendons
     servos = [servo for _, servo in s.servos]
     there = (
-        (ArmFault.VEHICLE_LOST, vehicle.heartbeat_age_s > s.config.vehicle.heartbeat_timeout_s),
+        (ArmFault.VEHICLE_LOST, not s.vehicle_heard),
         (ArmFault.VEHICLE_STATE_STALE, not s.vehicle_fresh),
         (ArmFault.AUTOPILOT_FAILSAFE, vehicle.control is Control.FAILSAFE),
         (ArmFault.SERVO_SILENT, any(servo.silent for servo in servos)),

@@ -94,16 +94,17 @@ class Situation:
 
     # --- the vehicle ---
 
+    @property
+    def vehicle_heard(self) -> bool:
+        """Whether the autopilot's heartbeat still comes."""
+        return self.facts.vehicle.heartbeat_age_s <= self.config.vehicle.heartbeat_timeout_s
+
     @cached_property
     def vehicle_fresh(self) -> bool:
         """Whether position and attitude are new enough to act on."""
         v = self.facts.vehicle
         limit = self.config.vehicle.state_timeout_s
-        return (
-            v.position_age_s <= limit
-            and v.attitude_age_s <= limit
-            and v.heartbeat_age_s <= self.config.vehicle.heartbeat_timeout_s
-        )
+        return v.position_age_s <= limit and v.attitude_age_s <= limit and self.vehicle_heard
 
     @property
     def external(self) -> bool:
@@ -153,7 +154,7 @@ class Situation:
         """Estimated tendon tensions, N."""
         return tuple(tendon.tension for tendon in self.facts.tendons)
 
-    @property
+    @cached_property
     def servos(self) -> tuple[tuple[str, TendonState | JawState], ...]:
         """What moves every tendon and the gripper, with its name for people."""
         tendons = tuple((f"tendon {i + 1}", tendon) for i, tendon in enumerate(self.facts.tendons))
