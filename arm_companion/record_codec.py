@@ -80,11 +80,12 @@ def _same(value: Any) -> Any:
 @functools.cache
 def _writer(hint: Any) -> Callable[[Any], Any]:
     """What turns a value of this type into what JSON knows; found out once for each type."""
+    hint, optional = _optional(hint)
+    if optional:
+        inner = _writer(hint)
+        return lambda value: None if value is None else inner(value)
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        (inner,) = (_writer(a) for a in arguments if a is not type(None))
-        return lambda value: None if value is None else inner(value)
     if origin is tuple:
         return _tuple_writer(arguments)
     if origin is frozenset:
@@ -109,61 +110,82 @@ def _tuple_writer(inner: tuple[Any, ...]) -> Callable[[Any], Any]:
     return lambda value: [write(item) for write, item in zip(writers, value, strict=True)]
 
 
-def _summer(numbers: tuple[str, ...]) -> Callable[[Any], float]:
-    """What adds up these fields of a value: not finite if one of them is not."""
-    if not numbers:
-        return lambda _: 0.0
-    if len(numbers) == 1:
-        return operator.attrgetter(*numbers)
-    get = operator.attrgetter(*numbers)
-    return lambda value: sum(get(value))
-
-
 def _content(value: Any) -> dict[str, Any]:
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
 
 
-def _record_writer(cls: Any) -> Callable[[Any], Any]:
-    """Much of a record is the very object of the cycle before, so what it became last is kept.
+def _is_numbers(hint: Any) -> bool:
+    return typing.get_origin(hint) is tuple and set(typing.get_args(hint)) <= {float, Ellipsis}
 
-    This runs for all of a record in every cycle: its fields are copied as they are, and only those that JSON does not
-    know are looked at one by one.
+
+def _optional(hint: Any) -> tuple[Any, bool]:
+    """The type without None, and whether None was there."""
+    if typing.get_origin(hint) not in (types.UnionType, typing.Union):
+        return hint, False
+    (inner,) = (a for a in typing.get_args(hint) if a is not type(None))
+    return inner, True
+
+
+_TABLE_OF = """
+def make():
+    seen = table = None
+    def table_of(value):
+        nonlocal seen, table
+        if value is not seen:
+            t = {copy}
+            total = 0.0
+            {changes}
+            if total - total != 0.0:
+                {infinite}
+            seen, table = value, t
+        return table
+    return table_of
+"""
+
+
+def _record_writer(cls: Any) -> Callable[[Any], Any]:
+    """Python made for this class, as `dataclasses` makes it, because it runs for all of a record in every cycle.
+
+    Much of a record is the very object of the cycle before, so what it became last is kept. Fields are copied as they
+    are, and only those that JSON does not know are changed. Numbers are added up; where the sum is not finite, which
+    is seldom, each of them is looked at.
     """
     kinds = fields(cls)
-    left_out = tuple(f.name for f in dataclasses.fields(cls) if f.name not in kinds)
-    numbers = tuple(name for name, hint in kinds.items() if hint is float)
-    sum_up = _summer(numbers)
-    others = [(name, each) for name, hint in kinds.items() if hint is not float and (each := _writer(hint)) != _same]
+    used: dict[str, Any] = {"content": _content, "number": _number, "numbers": _numbers}
+    changes = [f"del t[{f.name!r}]" for f in dataclasses.fields(cls) if f.name not in kinds]
+    infinite = ["pass"]
+    for name, kind in kinds.items():
+        hint, optional = _optional(kind)
+        field = f"t[{name!r}]"
+        present = f"if {field} is not None: " if optional else ""
+        if hint is float:
+            changes.append(f"{present}total += {field}")
+            infinite.append(f"{present}{field} = number({field})")
+        elif _is_numbers(hint):
+            changes.append(f"{present}total += sum({field})")
+            infinite.append(f"{present}{field} = numbers({field})")
+        elif (each := _writer(hint)) != _same:
+            used[f"write_{name}"] = each
+            changes.append(f"{present}{field} = write_{name}({field})")
     slotted = hasattr(cls, "__slots__")  # calibrations, written once in a while
-    last: tuple[Any, Any] = (None, None)
-
-    def table_of(value: Any) -> Any:
-        nonlocal last
-        seen, table = last
-        if value is not seen:
-            table = _content(value) if slotted else value.__dict__.copy()
-            for name in left_out:
-                del table[name]
-            for name, write_field in others:
-                table[name] = write_field(table[name])
-            total = sum_up(value)
-            if total - total != 0.0:  # of few records, and then its numbers are looked at
-                for name in numbers:
-                    table[name] = _number(table[name])
-            last = (value, table)
-        return table
-
-    return table_of
+    source = _TABLE_OF.format(
+        copy="content(value)" if slotted else "value.__dict__.copy()",
+        changes="\n            ".join(changes),
+        infinite="\n                ".join(infinite),
+    )
+    exec(source, used)  # noqa: S102 - made of the names of fields alone
+    return typing.cast("Callable[[Any], Any]", used["make"]())
 
 
 @functools.cache
 def _builder(hint: Any) -> Callable[[Any], Any]:
     """What turns JSON into a value of this type; found out once for each type."""
+    hint, optional = _optional(hint)
+    if optional:
+        inner = _builder(hint)
+        return lambda value: None if value is None else inner(value)
     origin = typing.get_origin(hint)
     arguments = typing.get_args(hint)
-    if origin in (types.UnionType, typing.Union):
-        (inner,) = (_builder(a) for a in arguments if a is not type(None))
-        return lambda value: None if value is None else inner(value)
     if origin is tuple:
         return _tuple_builder(arguments)
     if origin is frozenset:

@@ -1,17 +1,49 @@
-"""One MCAP file being written: channels made when first used, chunks that survive a power loss."""
+"""One MCAP file being written: channels made when first used, chunks that survive a power loss.
+
+The `mcap` library says what its records look like. Its writer makes an object and a dozen small writes of every
+message, a third of what recording took of a core at 200 Hz, so messages are put into their chunk here.
+"""
 
 import contextlib
 import os
+import struct
+import zlib
+from array import array
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
 import orjson
-from mcap.writer import CompressionType, Writer
+import zstandard
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+from mcap.records import (
+    Channel,
+    Chunk,
+    ChunkIndex,
+    DataEnd,
+    Footer,
+    Header,
+    McapRecord,
+    Metadata,
+    MetadataIndex,
+    Schema,
+    Statistics,
+    SummaryOffset,
+)
+from mcap.writer import MCAP0_MAGIC
 
 from arm_companion.record.topics import METADATA, SCHEMAS, schema_text
 
 _CHUNK: Final = 256 * 1024
 """Bytes of a chunk before compression: what a power loss costs at most, a quarter of a second at 200 Hz."""
+_LEVEL: Final = 1
+"""Of zstd: cycles are alike, and more effort makes them no smaller."""
+_MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence, time of logging, of publishing
+_BEFORE_DATA: Final = _MESSAGE.size - 9  # what counts as the message's length beside its data
+_INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries
+_FOOTER: Final = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, of its offsets
 
 
 class McapFile:
@@ -27,13 +59,21 @@ class McapFile:
 
     def __init__(self, path: Path, versions: dict[str, str]) -> None:
         self._stream = path.open("wb")
-        self._writer = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD)
-        self._channels: dict[str, int] = {}
+        self._compressor = zstandard.ZstdCompressor(level=_LEVEL)
+        self._numbers: dict[str, int] = {}  # of the channels, by topic
+        self._schemas: list[Schema] = []
+        self._channels: list[Channel] = []
+        self._chunks: list[ChunkIndex] = []
+        self._counts: dict[int, int] = {}  # messages of each channel
+        self._open = _OpenChunk()
         try:
-            self._writer.start(profile="", library="arm-companion")
-            self._writer.add_metadata(METADATA, versions)
+            self._stream.write(MCAP0_MAGIC)
+            self._append(Header(profile="", library="arm-companion"))
+            at = self._stream.tell()
+            length = self._append(Metadata(name=METADATA, metadata=versions))
+            self._metadata = MetadataIndex(offset=at, length=length, name=METADATA)
             for topic in SCHEMAS:
-                self._open(topic)
+                self._add_channel(topic)
         except OSError:
             self._stream.close()
             raise
@@ -49,8 +89,10 @@ class McapFile:
 
     def raw(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
         """Add bytes as they are."""
-        channel = self._channels.get(topic) or self._open(topic)
-        self._writer.add_message(channel, unix_ns, data, unix_ns, sequence)
+        channel = self._numbers.get(topic) or self._add_channel(topic)
+        self._open.add(channel, unix_ns, data, sequence)
+        if self._open.size > _CHUNK:
+            self._end_chunk()
 
     def sync(self) -> None:
         """Have the whole chunks so far on the disk."""
@@ -60,7 +102,9 @@ class McapFile:
     def close(self) -> None:
         """Write index and end."""
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._end_chunk()
+            self._append(DataEnd(data_section_crc=0))
+            self._end()
         finally:
             self._stream.close()
 
@@ -69,12 +113,141 @@ class McapFile:
         with contextlib.suppress(OSError):
             self._stream.close()
 
-    def _open(self, topic: str) -> int:
-        number = 0
-        encoding = "application/octet-stream"
+    def _add_channel(self, topic: str) -> int:
+        schema, encoding = 0, "application/octet-stream"
         if topic in SCHEMAS:
             name, text = schema_text(topic)
-            number = self._writer.register_schema(name, "jsonschema", text)
-            encoding = "json"
-        self._channels[topic] = channel = self._writer.register_channel(topic, encoding, number)
-        return int(channel)
+            schema, encoding = len(self._schemas) + 1, "json"
+            self._schemas.append(Schema(id=schema, name=name, encoding="jsonschema", data=text))
+            self._open.define(self._schemas[-1])
+        number = len(self._channels) + 1
+        self._channels.append(Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema))
+        self._open.define(self._channels[-1])
+        self._numbers[topic] = number
+        return number
+
+    def _end_chunk(self) -> None:
+        chunk, self._open = self._open, _OpenChunk()
+        if not chunk.entries:
+            return
+        content = b"".join(chunk.parts)
+        packed = self._compressor.compress(content)
+        times = [entries[0::2] for entries in chunk.entries.values()]
+        begin, end = min(map(min, times)), max(map(max, times))
+        at = self._stream.tell()
+        length = self._append(
+            Chunk(
+                compression="zstd",
+                data=packed,
+                message_start_time=begin,
+                message_end_time=end,
+                uncompressed_crc=zlib.crc32(content),
+                uncompressed_size=len(content),
+            )
+        )
+        offsets = {}
+        for channel, entries in chunk.entries.items():
+            offsets[channel] = self._stream.tell()
+            self._counts[channel] = self._counts.get(channel, 0) + len(entries) // 2
+            count = len(entries) * entries.itemsize
+            self._stream.write(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + count, channel, count) + _little(entries))
+        self._chunks.append(
+            ChunkIndex(
+                message_start_time=begin,
+                message_end_time=end,
+                chunk_start_offset=at,
+                chunk_length=length,
+                message_index_offsets=offsets,
+                message_index_length=self._stream.tell() - at - length,
+                compression="zstd",
+                compressed_size=len(packed),
+                uncompressed_size=len(content),
+            )
+        )
+
+    def _end(self) -> None:
+        """The summary, by which a reader finds any time without reading everything, and the file's last bytes."""
+        begin = self._stream.tell()
+        summary, groups = RecordBuilder(), RecordBuilder()
+        for kind, records in groupby(
+            (*self._schemas, *self._channels, self._statistics(), *self._chunks, self._metadata), type
+        ):
+            start = summary.count
+            for record in records:
+                record.write(summary)
+            offset = SummaryOffset(_OPCODES[kind], begin + start, summary.count - start)
+            offset.write(groups)
+        offsets = begin + summary.count
+        text: bytes = summary.end() + groups.end()  # type: ignore[no-untyped-call]
+        crc = zlib.crc32(_FOOTER.pack(Opcode.FOOTER, 20, begin, offsets), zlib.crc32(text))
+        self._stream.write(text)
+        self._append(Footer(summary_start=begin, summary_offset_start=offsets, summary_crc=crc))
+        self._stream.write(MCAP0_MAGIC)
+
+    def _statistics(self) -> Statistics:
+        return Statistics(
+            attachment_count=0,
+            channel_count=len(self._channels),
+            channel_message_counts=self._counts,
+            chunk_count=len(self._chunks),
+            message_count=sum(self._counts.values()),
+            message_end_time=max(map(attrgetter("message_end_time"), self._chunks), default=0),
+            message_start_time=min(map(attrgetter("message_start_time"), self._chunks), default=0),
+            metadata_count=1,
+            schema_count=len(self._schemas),
+        )
+
+    def _append(self, record: McapRecord) -> int:
+        """Write one of the library's records; bytes that it takes."""
+        data = _bytes(record)
+        self._stream.write(data)
+        return len(data)
+
+
+_OPCODES: Final = {
+    Schema: Opcode.SCHEMA,
+    Channel: Opcode.CHANNEL,
+    Statistics: Opcode.STATISTICS,
+    ChunkIndex: Opcode.CHUNK_INDEX,
+    MetadataIndex: Opcode.METADATA_INDEX,
+}
+
+
+class _OpenChunk:
+    """Records that wait to be compressed together.
+
+    Attributes:
+        parts: their bytes.
+        size: how many these are.
+        entries: of each channel's index: time and place of every message, in turn.
+    """
+
+    def __init__(self) -> None:
+        self.parts: list[bytes] = []
+        self.size = 0
+        self.entries: dict[int, array[int]] = {}
+
+    def define(self, record: Schema | Channel) -> None:
+        data = _bytes(record)
+        self.parts.append(data)
+        self.size += len(data)
+
+    def add(self, channel: int, unix_ns: int, data: bytes, sequence: int) -> None:
+        if channel not in self.entries:
+            self.entries[channel] = array("Q")
+        self.entries[channel].extend((unix_ns, self.size))
+        length = _BEFORE_DATA + len(data)
+        self.parts += (_MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, unix_ns, unix_ns), data)
+        self.size += 9 + length
+
+
+def _bytes(record: McapRecord) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return data
+
+
+def _little(numbers: "array[int]") -> bytes:
+    """In the byte order of the file, which is that of every machine this runs on."""
+    return struct.pack(f"<{len(numbers)}Q", *numbers)

@@ -25,12 +25,12 @@ class KeyGuard:
         """Whether bytes may be written; with a key's header in them neither they nor what follows at once may."""
         joined = self._tail + data
         self._tail = joined[-(_HEADER - 1) :]
-        at = joined.find(_MAGIC)
+        at = joined.find(_SETUP_SIGNING, _ID_AT)  # rarer than the magic byte
         while at >= 0:
-            if joined[at + _ID_AT : at + _HEADER] == _SETUP_SIGNING:
+            if joined[at - _ID_AT] == _MAGIC:
                 self._silent_until = t + _REST_S
                 break
-            at = joined.find(_MAGIC, at + 1)
+            at = joined.find(_SETUP_SIGNING, at + 1)
         return t >= self._silent_until
 
 

@@ -1,6 +1,7 @@
 """What the daemon tells whoever records it; nothing here ever waits."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from arm_companion.config.schema import Config
 from arm_companion.mission.facts import Commands, Facts, Notice
@@ -17,8 +18,7 @@ class Record:
     commands: Commands
 
 
-@dataclass(frozen=True, slots=True)
-class Frame:
+class Frame(NamedTuple):
     """Bytes that passed over a link or the servo bus at once."""
 
     t: float  # loop time, s

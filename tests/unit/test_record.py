@@ -10,13 +10,15 @@ import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import orjson
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
-from mcap.records import Chunk
+from mcap.records import Channel, Chunk, DataEnd, Message, Schema, SummaryOffset
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
@@ -29,14 +31,14 @@ from arm_companion.mission.facts import Commands, Notice, Severity, VehicleState
 from arm_companion.mission.state import State
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MavlinkCodec
-from arm_companion.record import configured_recorder, storage
+from arm_companion.record import configured_recorder, mcap_file, storage
 from arm_companion.record.file_recorder import FileRecorder
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.raw import KeyGuard
 from arm_companion.record.reader import Reader
 from arm_companion.record.recorder import Frame, Record, Recorder
 from arm_companion.record.replay import Cycle, cycles
-from arm_companion.record.topics import COMMANDS, FACTS, LOG, SCHEMAS, TRANSITIONS, transition
+from arm_companion.record.topics import COMMANDS, FACTS, LOG, METADATA, SCHEMAS, TRANSITIONS, schema_text, transition
 from arm_companion.record.versions import versions
 from arm_companion.record_codec import build, dumps, loads
 
@@ -120,6 +122,63 @@ def test_the_stock_reader_finds_every_channel_with_a_schema_that_fits(tmp_path: 
             seen.add(channel.topic)
     assert {FACTS, "/state", COMMANDS, LOG, TRANSITIONS, "/configuration"} <= seen
     assert sum(raw) == 1500 * len(records()), "raw bytes are joined, and none is lost"
+
+
+MESSAGES = st.lists(
+    st.tuples(
+        st.sampled_from([*SCHEMAS, "/raw/servos/sent", "/raw/mavlink/autopilot/received"]),
+        st.integers(0, 2**63),  # Unix time, ns; it may step back
+        st.binary(max_size=70).map(lambda seed: seed * 900),  # up to a quarter of a chunk
+        st.integers(0, 2**32 - 1),
+    ),
+    max_size=30,
+)
+
+
+@settings(max_examples=30, deadline=None)
+@given(MESSAGES)
+def test_the_librarys_own_writer_would_have_said_the_same(messages: list[tuple[str, int, bytes, int]]) -> None:
+    with TemporaryDirectory() as directory:
+        ours, theirs = Path(directory) / "ours.mcap", Path(directory) / "theirs.mcap"
+        file = McapFile(ours, {"format": "1"})
+        with theirs.open("wb") as stream:
+            writer = Writer(stream, chunk_size=mcap_file._CHUNK)
+            writer.start(profile="", library="arm-companion")
+            writer.add_metadata(METADATA, {"format": "1"})
+            channels: dict[str, int] = {}
+            for topic in SCHEMAS:
+                name, text = schema_text(topic)
+                schema = writer.register_schema(name, "jsonschema", text)
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            for topic, t, data, sequence in messages:
+                file.raw(topic, t, data, sequence)
+                if topic not in channels:
+                    channels[topic] = writer.register_channel(topic, "application/octet-stream", 0)
+                writer.add_message(channels[topic], t, data, t, sequence)
+            writer.finish()
+        file.close()
+        times = sorted(t for _, t, _, _ in messages[::3]) or [0]  # some of them
+        window = (times[0], times[-1])
+        assert told(ours, *window) == told(theirs, *window)
+
+
+def told(path: Path, start: int, end: int) -> list[Any]:
+    """What the library's readers say of a file; the one that goes by the index needs all offsets to be right."""
+    with path.open("rb") as stream:
+        in_order = [
+            (kind.__name__, vars(record)) if kind in (Schema, Channel, Message, DataEnd) else kind.__name__
+            for record in StreamReader(stream, validate_crcs=True).records
+            for kind in [type(record)]
+            if not (kind is SummaryOffset and record.group_length == 0)
+        ]
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        chunks = [(c.message_start_time, c.message_end_time, c.uncompressed_size) for c in summary.chunk_indexes]
+        found = [message for _, _, message in reader.iter_messages(starting_at=start, ending_at=end, reverse=True)]
+        metadata = [(record.name, record.metadata) for record in reader.iter_metadata()]
+        return [in_order, summary.statistics, summary.schemas, summary.channels, chunks, found, metadata]
 
 
 def fits(value: object, schema: dict, where: str) -> None:
