@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import gc
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -42,7 +43,7 @@ from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.onlookers import Onlookers
 from arm_companion.record import configured_recorder
-from arm_companion.record.raw import tapped
+from arm_companion.record.raw import Taps
 from arm_companion.record.recorder import Record, Recorder
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
@@ -99,11 +100,13 @@ class Daemon:
         self._manager = manager
         self._recorder = configured_recorder(config, clock) if recorder is None else recorder
         self._recorder.configure(clock.now(), config)
-        openers = self._tap(openers)
+        self._taps = Taps(self._recorder)
         self._compiled_model = compiled_model
         self._parameters = Parameters(config, model or RodModel(ArmParameters.of(config.arm)))
         self._links = [
-            MavlinkLink(name, link.role, openers.links[name], config.vehicle, config=link)
+            MavlinkLink(
+                name, link.role, self._taps.tapped(openers.links[name], f"mavlink/{name}"), config.vehicle, config=link
+            )
             for name, link in config.links.items()
         ]
         self._keeper = Keeper()
@@ -136,7 +139,7 @@ class Daemon:
         self._started = clock.now()
         self._calibrated = Calibrated(config, clock.unix(clock.now()))
         self._bus = ServoBus(
-            openers.servos,
+            self._taps.tapped(openers.servos, "servos"),
             with_gripper(self._calibrated.servos, config.gripper_servo),
             parked=self._calibrated.parked,
             parked_window=config.calibration.turned_ticks,
@@ -198,14 +201,6 @@ class Daemon:
                 self._keeper.close()
                 self._recorder.close()
 
-    def _tap(self, openers: Openers) -> Openers:
-        """The openers with what passes told to the recorder, if it wants that."""
-        if not self._recorder.raw:
-            return openers
-        now = self._clock.now
-        links = {name: tapped(opener, f"mavlink/{name}", self._recorder, now) for name, opener in openers.links.items()}
-        return Openers(links, tapped(openers.servos, "servos", self._recorder, now))
-
     async def _prepare_model(self) -> None:
         """The compiled mechanics from numba's cache, where there are any; links and heartbeats run meanwhile.
 
@@ -225,6 +220,8 @@ class Daemon:
     async def _cycles(self) -> None:
         if self._compiled_model:
             await self._prepare_model()
+            gc.set_threshold(10_000)  # what a record keeps for a moment is no garbage
+            gc.freeze()  # modules and compiled code are here to stay: to look through them took 80 ms, in flight
         if isinstance(self._parameters.model, RodModel):
             self._recorder.mechanics("numba" if self._parameters.model.fast else "numpy")
         self._manager.ready()
@@ -244,6 +241,7 @@ class Daemon:
             self.cycles += 1
 
     async def _cycle(self) -> None:
+        self._taps.hand_over(self._clock.now())
         facts = await self._observe()
         now = self._clock.now()
         before = self._state

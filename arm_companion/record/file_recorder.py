@@ -1,17 +1,21 @@
 """The daemon's record on disk, written by a thread of its own behind a bounded queue.
 
-The loop's part of a cycle is one entry into the queue. A slow disk costs records, a full one the rest of the record
-until there is room again; both are counted and told, and neither ever costs a cycle.
+The loop puts cycles into words, a few at a time, since the first takes three times as long as those right behind it.
+What is left to the thread, compression above all, hardly needs the interpreter, for which the next cycle would have to
+wait. A slow disk costs records, a full one the rest of the record until there is room again; both are counted and told,
+and neither ever costs a cycle.
 """
 
 import collections
 import logging
-import queue
+import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
+
+import orjson
 
 from arm_companion.config.schema import Config, RecordConfig
 from arm_companion.config.table import as_table
@@ -34,34 +38,47 @@ from arm_companion.record_codec import plain
 
 log = logging.getLogger(__name__)
 
-_QUEUE: Final = 1000
-"""Cycles that wait for the disk: five seconds at 200 Hz."""
+_TOGETHER: Final = 10
+"""Cycles that are put into words at once: half a millisecond of the last one's time."""
+_QUEUE: Final = 100
+"""Batches of so many cycles that wait for the disk: five seconds at 200 Hz."""
 _SYNC_S: Final = 2.0
 _RETRY_S: Final = 10.0
 _RAW_S: Final = 1.0
-_JOIN_S: Final = 0.05
-"""Raw bytes of a pipe that are one message of the record."""
+_GATHER_S: Final = 0.1
+"""So often does the thread wake up."""
+_SWITCH_S: Final = 0.0005
+"""So long does a cycle wait at most for the interpreter while the thread has it."""
+_AT_ONCE: Final = 10
 _BREATH_S: Final = 0.001
-_GATHER_S: Final = 0.025
-_FEW: Final = 10
+"""Pause after each batch of a longer backlog, and while the queue of a patient recorder is full."""
 _MB: Final = 1_000_000
+
+
+class _Cycle(NamedTuple):
+    """Facts, memory and commands of a cycle, as they stand in the file."""
+
+    sequence: int
+    t: float
+    facts: bytes
+    state: bytes
+    commands: bytes
 
 
 @dataclass(slots=True)
 class _Batch:
-    """What came since the last cycle, and the cycle that ends it."""
+    """A few cycles, and what came since the ones before."""
 
     configs: list[tuple[float, Config]] = field(default_factory=list)
     notices: list[tuple[float, Notice]] = field(default_factory=list)
     frames: list[Frame] = field(default_factory=list)
-    record: Record | None = None
-    sequence: int = 0
+    cycles: list[_Cycle] = field(default_factory=list)
     last: bool = False
 
     @property
     def t(self) -> float | None:
-        if self.record is not None:
-            return self.record.t
+        if self.cycles:
+            return self.cycles[-1].t
         return next((item[0] for item in (*self.configs, *self.notices)), None)
 
 
@@ -96,8 +113,9 @@ class FileRecorder(Recorder):
         self._unix = unix
         self._patient = patient
         self._open_file = open_file
-        self._queue: queue.Queue[_Batch] = queue.Queue(_QUEUE)
+        self._queue: collections.deque[_Batch] = collections.deque()
         self._batch = _Batch()
+        self._records: list[Record] = []
         self._sequence = 0
         self._raw_left = 0.0
         self._raw_since = float("-inf")
@@ -108,18 +126,20 @@ class FileRecorder(Recorder):
         self._file: McapFile | None = None
         self._parts = 0
         self._begun = ""
-        self._frames: list[Frame] = []
         self._config: Config | None = None
         self._synced = self._retry_at = float("-inf")
         self._failing = False
-        self._breath = threading.Event()
+        self._hurry = threading.Event()
+        self._breath = threading.Event()  # never set
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
         self._thread.start()
+        sys.setswitchinterval(_SWITCH_S)
 
     # --- called on the loop ---
 
     def configure(self, t: float, config: Config) -> None:
         """See `Recorder`."""
+        self._flush()  # what came before is of the configuration before
         self._batch.configs.append((t, config))
 
     def mechanics(self, name: str) -> None:
@@ -142,25 +162,34 @@ class FileRecorder(Recorder):
             self._troubles.append(f"record: raw bytes beyond {self._options.raw_kb_per_s:g} kB/s are left out")
 
     def put(self, record: Record) -> None:
-        """Queue the cycle with all that came since the one before, or count it as dropped."""
-        self._batch.record = record
-        self._batch.sequence = self._sequence
-        self._sequence += 1
-        batch, self._batch = self._batch, _Batch()
-        if self._patient:
-            self._queue.put(batch)
-            return
-        try:
-            self._queue.put_nowait(batch)
-        except queue.Full:
-            self.dropped += 1
-            self._batch.configs = batch.configs  # without these no replay; what was said is small, too
-            self._batch.notices = batch.notices[-100:]
+        """Take the cycle, or count it as dropped."""
+        self._records.append(record)
+        if len(self._records) >= _TOGETHER:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Queue the cycles with all that came since those before."""
+        records, self._records = self._records, []
+        first, self._sequence = self._sequence, self._sequence + len(records)
+        while self._patient and len(self._queue) >= _QUEUE:
+            self._hurry.set()
+            self._breath.wait(_BREATH_S)
+        if len(self._queue) >= _QUEUE:
+            self.dropped += len(records)
+            self._batch.notices = self._batch.notices[-100:]  # they are small, and without configurations no replay
+            self._batch.frames.clear()
             if not self._slow:
                 self._slow = True
                 self._troubles.append("record: the disk is too slow, cycles are missing")
             return
-        if self._slow and self._queue.qsize() < _QUEUE // 2:
+        batch, self._batch = self._batch, _Batch()
+        try:
+            batch.cycles = [_in_words(first + i, record) for i, record in enumerate(records)]
+        except Exception:
+            log.exception("record: cycles could not be put into words")
+            self.dropped += len(records)
+        self._queue.append(batch)
+        if self._slow and len(self._queue) < _QUEUE // 2:
             self._slow = False
             self._troubles.append(f"record: complete again, {self.dropped} cycles are missing")
 
@@ -173,13 +202,12 @@ class FileRecorder(Recorder):
 
     def close(self) -> None:
         """Write what is queued; give up on a disk that hangs."""
-        self._batch.last = True
-        try:
-            self._queue.put(self._batch, timeout=1.0)
-        except queue.Full:
-            log.warning("record: the disk does not take the last cycles")
-            return
+        self._flush()
+        self._queue.append(_Batch(last=True))
+        self._hurry.set()
         self._thread.join(timeout=None if self._patient else 5.0)
+        if self._thread.is_alive():
+            log.warning("record: the disk does not take the last cycles")
         for text in self.troubles():
             log.warning("%s", text)
         if self.dropped:
@@ -188,32 +216,30 @@ class FileRecorder(Recorder):
     # --- the thread ---
 
     def _run(self) -> None:
-        while True:
-            batch = self._queue.get()
+        ended = False
+        while not ended:
+            self._hurry.wait(_GATHER_S)
+            self._hurry.clear()
+            ended = self._write_queued()
+        self._finish()
+
+    def _write_queued(self) -> bool:
+        """Write what waits; whether it ended with the record's last."""
+        behind = len(self._queue) > _AT_ONCE and not self._patient
+        while self._queue:
+            batch = self._queue.popleft()
             try:
                 self._take(batch)
             except OSError as error:
                 self._fail(batch, error)
             except Exception:
-                log.exception("record: a cycle could not be written")
-                self.dropped += 1
+                log.exception("record: cycles could not be written")
+                self.dropped += len(batch.cycles)
             if batch.last:
-                break
-            if not self._patient:
-                self._rest()
-        self._finish()
-
-    def _rest(self) -> None:
-        """Leave the interpreter to the cycle.
-
-        To wake up costs as much as to write a cycle, so a few are gathered; few, because the cycle waits for the
-        lock while they are encoded. With a long backlog every one is followed by a pause.
-        """
-        waiting = self._queue.qsize()
-        if waiting == 0:
-            self._breath.wait(_GATHER_S)
-        elif waiting > _FEW:
-            self._breath.wait(_BREATH_S)
+                return True
+            if behind:  # leave the interpreter to the cycle
+                self._breath.wait(_BREATH_S)
+        return False
 
     def _take(self, batch: _Batch) -> None:
         if batch.configs:
@@ -223,7 +249,7 @@ class FileRecorder(Recorder):
             return
         if self._file is None:
             if t < self._retry_at:
-                self.dropped += batch.record is not None
+                self.dropped += len(batch.cycles)
                 return
             self._next_part(t)
         file = self._file
@@ -249,21 +275,14 @@ class FileRecorder(Recorder):
             if change is not None:
                 before, after, cause = change
                 file.json(TRANSITIONS, now, {"t": t, "before": before, "after": after, "cause": cause})
-        self._frames += batch.frames
-        if self._frames and self._frames[-1].t - self._frames[0].t >= _JOIN_S:
-            self._write_frames(file)
-        if (record := batch.record) is not None:
-            now = self._ns(record.t)
-            stamp = {"t": record.t}
-            file.json(FACTS, now, stamp | plain(record.facts), batch.sequence)
-            file.json(STATE, now, plain(record.state), batch.sequence)
-            file.json(COMMANDS, now, stamp | plain(record.commands), batch.sequence)
-
-    def _write_frames(self, file: McapFile) -> None:
-        frames, self._frames = self._frames, []
-        for (pipe, sent), some in _joined(frames).items():
+        for (pipe, sent), frames in _by_pipe(batch.frames).items():
             way = "sent" if sent else "received"
-            file.raw(f"{RAW}{pipe}/{way}", self._ns(some[0].t), b"".join([frame.data for frame in some]))
+            file.raw(f"{RAW}{pipe}/{way}", self._ns(frames[0].t), b"".join([frame.data for frame in frames]))
+        for cycle in batch.cycles:
+            now = self._ns(cycle.t)
+            file.raw(FACTS, now, cycle.facts, cycle.sequence)
+            file.raw(STATE, now, cycle.state, cycle.sequence)
+            file.raw(COMMANDS, now, cycle.commands, cycle.sequence)
 
     def _write_config(self, file: McapFile, t: float, config: Config) -> None:
         file.json(CONFIGURATION, self._ns(t), {"t": t, "config": as_table(config)})
@@ -291,11 +310,10 @@ class FileRecorder(Recorder):
             raise OSError(f"less than {options.keep_free_mb:g} MB are free")
 
     def _fail(self, batch: _Batch, error: OSError) -> None:
-        self.dropped += batch.record is not None
+        self.dropped += len(batch.cycles)
         if self._file is not None:
             self._file.abandon()
             self._file = None
-        self._frames.clear()
         self._retry_at = (batch.t or 0.0) + _RETRY_S
         if not self._failing:
             self._failing = True
@@ -306,7 +324,6 @@ class FileRecorder(Recorder):
         if file is None:
             return
         try:
-            self._write_frames(file)
             file.close()
         except OSError as error:
             file.abandon()
@@ -316,7 +333,18 @@ class FileRecorder(Recorder):
         return round(self._unix(t) * 1e9)
 
 
-def _joined(frames: list[Frame]) -> dict[tuple[str, bool], list[Frame]]:
+def _in_words(sequence: int, record: Record) -> _Cycle:
+    stamp = {"t": record.t}
+    return _Cycle(
+        sequence,
+        record.t,
+        orjson.dumps(stamp | plain(record.facts)),
+        orjson.dumps(plain(record.state)),
+        orjson.dumps(stamp | plain(record.commands)),
+    )
+
+
+def _by_pipe(frames: list[Frame]) -> dict[tuple[str, bool], list[Frame]]:
     """Frames by pipe and direction: one message for each, since a message costs more than its bytes."""
     found: dict[tuple[str, bool], list[Frame]] = {}
     for frame in frames:

@@ -1,6 +1,5 @@
-"""Raw bytes for the record: an opener whose pipe tells a recorder what passes, keys excepted."""
+"""Raw bytes for the record: openers whose pipes tell a recorder what passes, keys excepted."""
 
-from collections.abc import Callable
 from typing import Final
 
 from arm_companion.record.recorder import Frame, Recorder
@@ -12,6 +11,7 @@ _SETUP_SIGNING: Final = b"\x00\x01\x00"  # message id 256, little-endian; MAVLin
 _ID_AT: Final = 7
 _HEADER: Final = 10
 _REST_S: Final = 0.2
+_JOIN_S: Final = 0.05
 
 
 class KeyGuard:
@@ -34,20 +34,39 @@ class KeyGuard:
         return t >= self._silent_until
 
 
-def tapped(opener: Opener, pipe: str, recorder: Recorder, now: Callable[[], float]) -> Opener:
-    """An opener of the same pipe whose bytes the recorder is given.
+class Taps:
+    """Hands the bytes of pipes to a recorder now and then: what happens for every chunk has to cost next to nothing.
 
     Args:
-        opener: of the pipe.
-        pipe: its name in the record.
         recorder: takes the bytes.
-        now: loop time, s.
     """
-    guards = {True: KeyGuard(), False: KeyGuard()}
 
-    def note(data: bytes, sent: bool) -> None:
-        t = now()
-        if guards[sent].passes(t, data):
-            recorder.frame(Frame(t, pipe, sent, bytes(data)))
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self._waiting: list[tuple[str, bool, list[bytes], KeyGuard]] = []
+        self._next = float("-inf")
 
-    return observed(opener, note)
+    def tapped(self, opener: Opener, pipe: str) -> Opener:
+        """An opener of the same pipe whose bytes go to the recorder, as bytes of the pipe of this name."""
+        if not self._recorder.raw:
+            return opener
+        received: list[bytes] = []
+        sent: list[bytes] = []
+        self._waiting += [(pipe, False, received, KeyGuard()), (pipe, True, sent, KeyGuard())]
+
+        def note(data: bytes, outward: bool) -> None:
+            (sent if outward else received).append(bytes(data))
+
+        return observed(opener, note)
+
+    def hand_over(self, t: float) -> None:
+        """Everything since the last time, as of loop time `t`, s, if that is long enough ago."""
+        if t < self._next:
+            return
+        self._next = t + _JOIN_S
+        for pipe, sent, chunks, guard in self._waiting:
+            if chunks:
+                data = b"".join(chunks)
+                chunks.clear()
+                if guard.passes(t, data):
+                    self._recorder.frame(Frame(t, pipe, sent, data))
