@@ -9,6 +9,7 @@ from typing import IO, NamedTuple
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import EndOfFile, InvalidMagic, McapError
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Metadata
 from mcap.stream_reader import StreamReader, get_chunk_data_stream
 
@@ -59,14 +60,33 @@ class Reader:
 
     def messages(self, topics: Collection[str] | None) -> Iterator[Item]:
         """The messages of some channels, or of all, part by part in the order of the file."""
-        path = self.path
-        while True:
+        for path in self._parts():
             yield from self._part(path, topics)
-            path = storage.following(path)
-            if not path.is_file() or self.versions.get("content") == "truth":
-                return
-            if _versions(path).get("begun") != self.versions.get("begun"):
-                return
+
+    def count(self, topic: str) -> int | None:
+        """Messages of a channel as the ends of the files tell them; None when one was cut off before its end."""
+        total = 0
+        for path in self._parts():
+            with path.open("rb") as stream:
+                try:
+                    summary = make_reader(stream).get_summary()
+                except Exception:  # noqa: BLE001 - whatever damaged bytes lead to
+                    return None
+            if summary is None or summary.statistics is None:
+                return None
+            numbers = [channel.id for channel in summary.channels.values() if channel.topic == topic]
+            total += sum(summary.statistics.channel_message_counts.get(number, 0) for number in numbers)
+        return total
+
+    def _parts(self) -> Iterator[Path]:
+        path = self.path
+        yield path
+        if self.versions.get("content") == "truth":
+            return
+        while (path := storage.following(path)).is_file() and _versions(path).get("begun") == self.versions.get(
+            "begun"
+        ):
+            yield path
 
     def _part(self, path: Path, topics: Collection[str] | None) -> Iterator[Item]:
         names: dict[int, str] = {}

@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import orjson
 
@@ -31,6 +31,15 @@ _QUANTITIES: Final = {
     "tendon goal": ("m", ("pulls",)),
     "vehicle set-point": ("m", ("setpoint", "position_w")),
 }
+
+
+class Written(NamedTuple):
+    """One cycle as it stands in the record."""
+
+    number: int
+    facts: bytes
+    state: bytes
+    commands: bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +144,25 @@ def cycles(reader: Reader) -> Iterator[Cycle | Config]:
         RecordError: facts are not what this version knows.
         ConfigError: so is a configuration.
     """
+    for found in written(reader):
+        if isinstance(found, Config):
+            yield found
+            continue
+        try:
+            yield cycle_of(found)
+        except (KeyError, ValueError) as error:
+            known = reader.versions.get("version", "?")
+            raise RecordError(
+                f"{reader.path}: cycle {found.number} cannot be read, the record is of version {known}: {error}"
+            ) from None
+
+
+def written(reader: Reader) -> Iterator[Written | Config]:
+    """The same, with the cycles still as text.
+
+    Raises:
+        ConfigError: a configuration is not what this version knows.
+    """
     parts: dict[str, Item] = {}
     for item in reader.messages((FACTS, STATE, COMMANDS, CONFIGURATION)):
         if item.topic == CONFIGURATION:
@@ -142,16 +170,18 @@ def cycles(reader: Reader) -> Iterator[Cycle | Config]:
             continue
         parts[item.topic] = item
         if item.topic == COMMANDS and FACTS in parts and parts[FACTS].sequence == item.sequence:
-            table = orjson.loads(parts[FACTS].data)
-            try:
-                t = float(table.pop("t"))
-                facts = build(Facts, table)
-            except (KeyError, ValueError) as error:
-                known = reader.versions.get("version", "?")
-                raise RecordError(
-                    f"{reader.path}: cycle {item.sequence} cannot be read, the record is of version {known}: {error}"
-                ) from None
-            yield Cycle(item.sequence, t, facts, parts[STATE].data if STATE in parts else b"", item.data)
+            yield Written(item.sequence, parts[FACTS].data, parts[STATE].data if STATE in parts else b"", item.data)
+
+
+def cycle_of(text: Written) -> Cycle:
+    """The cycle that a text tells of.
+
+    Raises:
+        KeyError, ValueError: its facts are not what this version knows.
+    """
+    table = orjson.loads(text.facts)
+    t = float(table.pop("t"))
+    return Cycle(text.number, t, build(Facts, table), text.state, text.commands)
 
 
 class Runner:

@@ -124,29 +124,28 @@ def remembered(target: Path, cycles: int, *, spoilt: int | None = None) -> None:
     file.close()
 
 
-def test_shares_are_together_the_whole_replay(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(shares, "_STRETCH", 40)
+def test_shares_are_together_the_whole_replay(tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     remembered(path, 150)
     whole = replay(Reader(path))
     assert whole.identical
-    parts = [shares.share(path, "", 2, k) for k in range(2)]
-    assert [part and part.cycles for part in parts] == [80, 70]
+    count = Reader(path).count(FACTS)
+    assert count == 150
+    parts = [shares.share(path, "", stretch) for stretch in shares.stretches(count, 3)]
+    assert [part and part.cycles for part in parts] == [67, 48, 35]
     moves = [move for part in parts if part is not None for move in part.recorded]
     assert sorted(moves, key=lambda move: move.seconds) == whole.recorded
     assert {move.after for move in moves} >= {"STOWED", "READYING", "READY"}
 
 
 @pytest.mark.parametrize("spoilt", [10, 60])
-def test_a_share_that_finds_a_difference_says_nothing(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, spoilt: int
-) -> None:
-    monkeypatch.setattr(shares, "_STRETCH", 40)
+def test_a_share_that_finds_a_difference_says_nothing(tmp_path: Path, spoilt: int) -> None:
     path = tmp_path / "r.mcap"
     remembered(path, 90, spoilt=spoilt)
-    assert shares.share(path, "", 2, spoilt // 40) is None
+    whose = (0, 40) if spoilt < 40 else (40, 90)
+    assert shares.share(path, "", whose) is None
     copy(path, upto=90)  # without memory
-    assert None in [shares.share(path, "", 2, k) for k in range(2)]
+    assert None in [shares.share(path, "", stretch) for stretch in ((0, 40), (40, 90))]
 
 
 def test_what_another_configuration_would_have_done(capsys: pytest.CaptureFixture[str]) -> None:
