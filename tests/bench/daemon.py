@@ -12,19 +12,22 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from arm_companion.app import Daemon, Openers
 from arm_companion.clock import Clock, precise_loop, ticks, unix_now
 from arm_companion.config import load
 from arm_companion.mission.facts import Order, Request
 from arm_companion.mission.state import Phase
-from arm_companion.record import configured_recorder
+from arm_companion.record import configured_recorder, raw
 from arm_companion.record.recorder import Recorder
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.serial import open_serial
+from arm_companion.transport.trace import observed
 from arm_companion.transport.udp import udp_in
 from tests.bench.listening import free_port, stream
 from tests.bench.measure import Result
@@ -47,6 +50,7 @@ class Taken:
     late: list[float]
     known_to_goal: list[float]
     missed: int
+    recording: float = 0.0
 
 
 def p99(samples: list[float]) -> float:
@@ -70,6 +74,8 @@ def daemon(_: int) -> Iterator[Result]:
         goal = 1e3 * p99(taken.known_to_goal)
         yield Result(f"{what}: state to goal, p99", goal, "ms")
         yield Result(f"{what}: cycles missed", taken.missed, f"/{len(taken.late)}")
+        if recorded:
+            yield Result(f"{what}: for the record", 100.0 * taken.recording, "%")
 
 
 def _measure(rate: float, *, recorded: bool) -> Taken:
@@ -96,16 +102,45 @@ async def _fly(rate: float, servos: Path, udp: int, folder: Path | None) -> Take
     clock = Clock(asyncio.get_running_loop(), unix_now())
     openers = Openers({name: udp_in("127.0.0.1", udp)}, open_serial(str(servos), config.servos.baud))
     recorder = Recorder() if folder is None else configured_recorder(config, clock)
-    flown = Daemon(config, openers, clock, ServiceManager(""), recorder, compiled_model=True)
+    meter = Meter(recorder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(raw, "observed", lambda opener, note: observed(opener, meter.of(note)))
+        flown = Daemon(config, openers, clock, ServiceManager(""), recorder, compiled_model=True)
+    recorder.put, flown._taps.hand_over = meter.of(recorder.put), meter.of(flown._taps.hand_over)  # type: ignore[method-assign]
     stop = asyncio.Event()
     running = asyncio.create_task(flown.run(stop))
     probe = Probe(flown)
     try:
         await probe.ready()
-        return await probe.watch(rate)
+        begun, before = time.perf_counter(), meter.seconds()
+        taken = await probe.watch(rate)
+        return dataclasses.replace(taken, recording=(meter.seconds() - before) / (time.perf_counter() - begun))
     finally:
         stop.set()
         await running
+
+
+class Meter:
+    """Processor time of a recorder: of its thread, and of what the loop calls for its sake."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        thread = getattr(recorder, "_thread", None)
+        self._clock = None if thread is None else time.pthread_getcpuclockid(thread.ident)
+        self._calls = 0.0
+
+    def of(self, work: Callable[..., None]) -> Callable[..., None]:
+        """The same work, with its time counted; looking at the clock is not."""
+
+        def metered(*arguments: Any) -> None:
+            begun = time.thread_time()
+            work(*arguments)
+            ended = time.thread_time()
+            self._calls += 2.0 * ended - begun - time.thread_time()
+
+        return metered
+
+    def seconds(self) -> float:
+        return self._calls + (0.0 if self._clock is None else time.clock_gettime(self._clock))
 
 
 class Probe:
