@@ -321,6 +321,21 @@ def test_a_command_becomes_a_request_and_its_fate_an_answer() -> None:
 
 
 @pytest.mark.parametrize(
+    ("command", "order", "parameters"),
+    [("CALIBRATE", ArmOrder.CALIBRATE, (1.0, 1.0)), ("REACH", ArmOrder.REACH, (0.0, 3.0, 0.5, -1.5))],
+)
+def test_the_later_orders_of_the_ground_come_by_mqtt_too(
+    command: str, order: ArmOrder, parameters: tuple[float, ...]
+) -> None:
+    async def test(desk: Desk) -> None:
+        assert desk.send(command, "a", *parameters) == []
+        (request,) = desk.requests()
+        assert (request.order, request.parameters) == (order, parameters)
+
+    at_a_desk(test)
+
+
+@pytest.mark.parametrize(
     ("words", "reason"),
     [
         (("READY", "n"), "s old"),
