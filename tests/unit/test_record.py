@@ -22,7 +22,7 @@ from mcap.records import Channel, Chunk, DataEnd, Message, Schema, SummaryOffset
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 
-from arm_companion.clock import Clock
+from arm_companion.clock import Clock, run_simulated
 from arm_companion.config import Config, load
 from arm_companion.config.schema import RecordConfig
 from arm_companion.config.table import as_table, from_table
@@ -34,13 +34,14 @@ from arm_companion.protocol.mavlink import MavlinkCodec
 from arm_companion.record import configured_recorder, mcap_file, storage
 from arm_companion.record.file_recorder import FileRecorder
 from arm_companion.record.mcap_file import McapFile
-from arm_companion.record.raw import KeyGuard
+from arm_companion.record.raw import KeyGuard, Taps
 from arm_companion.record.reader import Reader
 from arm_companion.record.recorder import Frame, Record, Recorder
 from arm_companion.record.replay import Cycle, cycles
 from arm_companion.record.topics import COMMANDS, FACTS, LOG, METADATA, SCHEMAS, TRANSITIONS, schema_text, transition
 from arm_companion.record.versions import versions
 from arm_companion.record_codec import build, dumps, loads
+from arm_companion.transport.memory import MemoryPipe
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "perch.mcap"
 CONFIG = load("sim.toml")
@@ -403,6 +404,61 @@ def test_a_signing_key_is_never_written(cut: int) -> None:
     assert beat in written
     assert key[:8] not in written
     assert guard.passes(1.0, beat)
+
+
+class Kept(Recorder):
+    """Keeps raw bytes."""
+
+    raw = True
+
+    def __init__(self) -> None:
+        self.frames: list[Frame] = []
+
+    def frame(self, frame: Frame) -> None:
+        self.frames.append(frame)
+
+
+def test_what_passes_is_told_joined_by_pipe_and_without_keys() -> None:
+    codec = MavlinkCodec(255, 190)
+    beat = codec.encode(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    secret = codec.encode(mav.MAVLink_setup_signing_message(1, 1, bytes(range(32)), 1))
+
+    async def pass_bytes() -> None:
+        link, servos = MemoryPipe(), MemoryPipe()
+        kept = Kept()
+        taps = Taps(kept)
+        ours = await taps.tapped(link.opener(0), "mavlink/x")(lambda _: None)
+        theirs = await link.opener(1)(lambda _: None)
+        bus = await taps.tapped(servos.opener(0), "servos")(lambda _: None)
+        ours.write(beat)
+        ours.write(bytearray(beat))
+        theirs.write(b"answer")
+        bus.write(b"ping")
+        await asyncio.sleep(0.01)
+        taps.hand_over(0.0)
+        assert [frame[1:] for frame in kept.frames] == [
+            ("mavlink/x", False, b"answer"),
+            ("mavlink/x", True, beat + beat),
+            ("servos", True, b"ping"),
+        ]
+        ours.write(secret[:8])
+        taps.hand_over(0.01)
+        assert len(kept.frames) == 3, "they wait, so that little is written at once"
+        taps.hand_over(0.06)
+        ours.write(secret[8:] + beat)
+        bus.write(b"pong")
+        taps.hand_over(0.12)
+        assert kept.frames[3:] == [(0.06, "mavlink/x", True, secret[:8]), (0.12, "servos", True, b"pong")]
+        ours.write(beat)
+        taps.hand_over(0.33)
+        assert kept.frames[-1].data == beat, "and on"
+
+    run_simulated(pass_bytes())
+
+
+def test_who_wants_no_raw_bytes_is_given_the_pipe_itself() -> None:
+    opener = MemoryPipe().opener(0)
+    assert Taps(Recorder()).tapped(opener, "servos") is opener
 
 
 def test_only_states_of_the_machine_make_a_transition() -> None:
