@@ -112,6 +112,13 @@ class PerchConfig:
         upper=50.0,
     )
     jog_max_m: float = option("largest move of the anchored vehicle", 0.03, unit="m", lower=0.001, upper=0.2)
+    jog_speed_m_per_s: float = option(
+        "speed of such a move; a fast one overshoots, because the arm turns the airframe with it",
+        0.004,
+        unit="m/s",
+        lower=0.0005,
+        upper=0.05,
+    )
     contact_timeout_s: float = option("time for the reach", 40.0, unit="s", lower=1.0, upper=300.0)
     state_timeout_s: float = option("time for any other moving state", 30.0, unit="s", lower=1.0, upper=600.0)
 

@@ -192,8 +192,12 @@ def test_a_perched_vehicle_is_moved_only_within_the_limit(parameters: Parameters
     state, said = run(held, ask(hovering(), Order.JOG, 3.0, 0.2, 0.0, 0.0), parameters)
     assert answers(said)[0].result is Result.TEMPORARILY_REJECTED
     assert state.offset == (0.0, 0.0, 0.0)
-    state, said = run(held, ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 2.0)
+    state, said = run(held, ask(hovering(), Order.JOG, 3.0, 0.01, 0.0, 0.0), parameters, 1.0)
     assert answers(said)[0].result is Result.ACCEPTED
+    assert state.reference is not None
+    speed = parameters.config.perch.jog_speed_m_per_s
+    assert 0.9 * speed < state.reference.position[0] - 2.0 < 1.1 * speed, "slowly, or it overshoots"
+    state, _ = run(state, hovering(), parameters, 3.0)
     assert state.reference is not None
     assert state.reference.position == pytest.approx((2.01, 0.0, -2.2))
 
