@@ -121,6 +121,18 @@ def test_the_jaws_close_once_the_vehicle_rests_with_the_object_between_them(
     assert max(math.hypot(*run.state.bend), math.hypot(*run.state.bend_goal)) < 0.01, "the arm stays straight"
 
 
+def test_a_vehicle_that_arrived_stays_where_it_was_asked_to_be_though_it_sways(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    state, facts = at_object(Phase.REACH, parameters, hovering, grip=OPENED)
+    assert state.reference is not None
+    x, y, z = state.reference.position
+    run = Run(dataclasses.replace(state, position=(x + 0.02, y, z)), parameters)
+    run.cycles(vehicle(position_w=(x + 0.02, y, z))(facts), 0.1)
+    assert run.phases == [Phase.REACH, Phase.CONTACT]
+    assert run.state.contact_w == pytest.approx((x, y, z))
+
+
 def test_a_tip_that_stands_on_something_stops_there(parameters: Parameters, hovering: Hovering) -> None:
     state, facts = at_object(Phase.REACH, parameters, hovering, grip=OPENED)
     x, y, z = state.position
