@@ -9,6 +9,7 @@ import pytest
 from arm_companion.config import load
 from arm_companion.config.schema import Config
 from arm_companion.errors import ConfigError
+from arm_companion.mission import gripper
 from arm_companion.mission.facts import ArmFault, ArmFlag, Control, Facts, Order, Result
 from arm_companion.mission.gripper_facts import (
     Grip,
@@ -239,6 +240,22 @@ def test_an_answer_that_is_too_young_is_waited_for(outputs: Parameters, hovering
     run = Run(state, outputs)
     run.cycles(answer(GripperFate.TAKEN, 1.9)(facts), 1.0)
     assert run.phases == [Phase.CLOSE]
+
+
+def test_jaws_that_stand_open_count_only_when_open_was_the_last_thing_they_were_told(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    for known, counts in ((Grip(), False), (CLOSED, False), (OPENED, True)):
+        s = Situation(memory(Phase.REACH, grip=known), jaws(closed=0.0)(hovering()), T0, parameters)
+        assert gripper.is_open(s) is counts
+
+
+def test_an_autopilots_gripper_that_does_not_close_has_no_figures_to_tell(
+    outputs: Parameters, hovering: Hovering
+) -> None:
+    state, facts = at_object(Phase.CLOSE, outputs, hovering, grip=CLOSED, since=T0 - 5.1)
+    facts = dataclasses.replace(facts, gripper=GripperState())
+    assert gripper.not_closed(Situation(state, facts, T0, outputs)) == "the gripper did not close within 5 s"
 
 
 # --- the test lift ---

@@ -76,6 +76,10 @@ def test_a_moving_servo_shows_more() -> None:
     assert run(0.0, 8.0, 3.0, tension_bias=1.0).broken
 
 
+def test_a_noisy_load_needs_a_greater_difference() -> None:
+    assert not run(0.0, 8.0, 3.0, tension_bias=1.0, tension_sigma=60.0).fault
+
+
 def test_a_tendon_that_is_too_tight_counts_only_where_nothing_else_can_pull_it() -> None:
     assert "tendon 1 jumped" in run(25.0, 4.0, 3.0).jumped
     assert not run(25.0, 4.0, 3.0, exact=False).fault

@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import pytest
 
-from arm_companion.mission.facts import Control, Facts
+from arm_companion.mission.facts import Control, Facts, WrenchReport, WrenchSource
 from arm_companion.mission.motion import Reference, add
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, Sharing, State, Vigil
+from arm_companion.mission.state import Phase, Prediction, Sharing, State, Vigil
 from arm_companion.mission.vigil import HEAT_MARGIN_K, VOLTAGE_MARGIN_V, keep_vigil
 from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Change, gripping, jaws, memory, moved, tendon, vehicle
 
@@ -84,6 +84,21 @@ def test_the_grippers_servo_counts_while_it_answers(parameters: Parameters, hove
         facts = jaws(temperature=99.0, voltage=1.0, silent=silent)(hovering())
         after = kept(state, facts, gripping(parameters)).vigil
         assert (after.hot_s > 0.0, after.low_s > 0.0) == (not silent, not silent)
+
+
+def test_blind_is_a_prediction_without_a_solution_for_a_vehicle_that_is_known(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    solved = WrenchReport((1.0, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1), WrenchSource.ANCHORED, True, 1.0, 0.0)
+    for residual, fields, counts in (
+        (math.nan, {}, True),
+        (0.0, {}, False),
+        (math.nan, {"position_age_s": 9.0}, False),
+    ):
+        wrench = dataclasses.replace(solved, residual=residual)
+        prediction = Prediction(T0, wrench, (0, 0, 0.25), (0, 0), (0, 0, 0))
+        state = memory(Phase.PERCHED, vigil=LASTED, prediction=prediction)
+        assert (kept(state, vehicle(**fields)(hovering()), parameters).vigil.blind_s > 0.0) is counts
 
 
 @pytest.mark.parametrize(
