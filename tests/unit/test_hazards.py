@@ -6,8 +6,8 @@ from collections.abc import Callable
 from arm_companion.mission import hazards
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase
-from tests.unit.mission_rig import T0, memory, vehicle
+from arm_companion.mission.state import Phase, Vigil
+from tests.unit.mission_rig import T0, memory, tendon, vehicle
 
 Hovering = Callable[..., Facts]
 
@@ -22,3 +22,16 @@ def test_the_motors_of_an_autopilot_that_has_never_been_heard_are_not_said_to_st
         assert (hazards.motors_stopped(s) is not None) is told
         stood = Situation(memory(Phase.PERCHED, armed=False), facts, T0, parameters)
         assert hazards.motors_stopped(stood) is None, "it does not stop twice"
+
+
+def test_a_slack_tendon_is_named(parameters: Parameters, hovering: Hovering) -> None:
+    facts = tendon(2, tension=-9.0)(hovering())
+    s = Situation(memory(Phase.READY, vigil=Vigil(slack_s=2.0)), facts, T0, parameters)
+    assert hazards.slack(s) == "tendon 3 slack: -9.0 N"
+
+
+def test_a_tendon_may_carry_its_limit_and_no_more(parameters: Parameters, hovering: Hovering) -> None:
+    limit = parameters.config.limits.tension_max_n
+    for tension, told in ((limit, False), (limit + 0.1, True)):
+        s = Situation(memory(Phase.PERCHED), tendon(1, tension=tension)(hovering()), T0, parameters)
+        assert (hazards.overstressed(s) is not None) is told

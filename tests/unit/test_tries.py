@@ -86,6 +86,8 @@ def test_a_grip_that_nobody_waits_for_is_not_tried_again(parameters: Parameters,
     flight = Flight(parameters, hovering, attempts=3, running=None)
     flight.until(Phase.STOWING)
     assert Phase.APPROACH not in flight.run.phases
+    assert flight.run.state.errors & ArmFault.GRIP_TEST_FAILED
+    assert not any("another try" in text for text in flight.run.texts)
 
 
 @pytest.mark.parametrize("order", [Order.ABORT, Order.STOW])
