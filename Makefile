@@ -7,7 +7,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 # what has a target of its own
 SHORT := not scenario and not soak and not sitl
 
-.PHONY: help setup demo test scenarios sitl soak check bench docs deb format clean
+.PHONY: help setup demo test scenarios sitl soak mutants check bench docs deb format clean
 .DEFAULT_GOAL := help
 
 help:  ## list the targets
@@ -44,6 +44,9 @@ soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questi
 	@$(BIN)/python -m pytest -m soak
 	@$(BIN)/python -m tests.soak
 
+mutants: $(STAMP)  ## put small faults into the mission and see that the tests notice (long; or MUTANTS='tries vigil --number 50')
+	@nice $(BIN)/python -m tests.mutants $(MUTANTS)
+
 check: $(STAMP)  ## lint, format, types and dependency directions
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
@@ -65,4 +68,4 @@ format: $(STAMP)  ## apply the formatter and the safe fixes
 	@$(BIN)/ruff format .
 
 clean:  ## remove everything that was made
-	@rm -rf $(VENV) build .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) build mutants .pytest_cache .mypy_cache .ruff_cache .hypothesis
