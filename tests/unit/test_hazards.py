@@ -1,5 +1,6 @@
 """What counts as a hazard, and what is only not known."""
 
+import dataclasses
 import math
 from collections.abc import Callable
 
@@ -35,3 +36,14 @@ def test_a_tendon_may_carry_its_limit_and_no_more(parameters: Parameters, hoveri
     for tension, told in ((limit, False), (limit + 0.1, True)):
         s = Situation(memory(Phase.PERCHED), tendon(1, tension=tension)(hovering()), T0, parameters)
         assert (hazards.overstressed(s) is not None) is told
+
+
+def test_a_ground_station_is_lost_only_after_it_was_heard(parameters: Parameters, hovering: Hovering) -> None:
+    for age, told in ((4.9, False), (5.1, True), (math.inf, False)):
+        facts = dataclasses.replace(hovering(), ground_age_s=age)
+        assert (hazards.ground_lost(Situation(memory(Phase.READY), facts, T0, parameters)) is not None) is told
+
+
+def test_the_hottest_servo_is_named(parameters: Parameters, hovering: Hovering) -> None:
+    s = Situation(memory(Phase.READY, vigil=Vigil(hot_s=2.0)), tendon(2, temperature=71.0)(hovering()), T0, parameters)
+    assert str(hazards.hot(s)).startswith("tendon 3: servo at 71 degC")
