@@ -55,7 +55,7 @@ def test_a_move_under_way_goes_on_with_the_last_stiffness_and_the_wrench_is_not_
     model = moody.model
     assert isinstance(model, Moody)
     facts = hovering(BENT)
-    state, _ = run(moving(moody, facts), facts, moody, 2.0)
+    state, _ = run(moving(moody, facts), facts, moody, 4.0)
     fed = norm(state.lean)
     assert fed > 0.05
     model.blind, model.starts = True, []
