@@ -77,7 +77,11 @@ class Client:
         goal = (0.6, 0.0, -HEIGHT_M)
         self.stream(1.3, *goal)
         self.link.set_mode("OFFBOARD")  # by name, through pymavlink's own table of PX4 modes
-        self.stream(3.0, *goal)
+        for _ in range(12):  # a busy machine takes longer
+            self.stream(1.0, *goal)
+            where = self.link.messages["LOCAL_POSITION_NED"]
+            if math.dist((where.x, where.y, where.z), goal) < 0.1:
+                break
         seen["mode"] = self.expect("HEARTBEAT", "HEARTBEAT.get_srcComponent()==1").custom_mode
         seen["flightmode"] = self.link.flightmode
         where = self.link.messages["LOCAL_POSITION_NED"]
