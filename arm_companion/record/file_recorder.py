@@ -139,7 +139,8 @@ class FileRecorder(Recorder):
 
     def configure(self, t: float, config: Config) -> None:
         """See `Recorder`."""
-        self._flush()  # what came before is of the configuration before
+        if self._records:  # of the configuration before
+            self._flush()
         self._batch.configs.append((t, config))
 
     def mechanics(self, name: str) -> None:
@@ -183,15 +184,26 @@ class FileRecorder(Recorder):
                 self._troubles.append("record: the disk is too slow, cycles are missing")
             return
         batch, self._batch = self._batch, _Batch()
-        try:
-            batch.cycles = [_in_words(first + i, record) for i, record in enumerate(records)]
-        except Exception:
-            log.exception("record: cycles could not be put into words")
-            self.dropped += len(records)
+        batch.cycles = [cycle for i, record in enumerate(records) if (cycle := self._in_words(first + i, record))]
         self._queue.append(batch)
         if self._slow and len(self._queue) < _QUEUE // 2:
             self._slow = False
             self._troubles.append(f"record: complete again, {self.dropped} cycles are missing")
+
+    def _in_words(self, sequence: int, record: Record) -> _Cycle | None:
+        stamp = {"t": record.t}
+        try:
+            return _Cycle(
+                sequence,
+                record.t,
+                orjson.dumps(stamp | plain(record.facts)),
+                orjson.dumps(plain(record.state)),
+                orjson.dumps(stamp | plain(record.commands)),
+            )
+        except Exception:
+            log.exception("record: a cycle could not be put into words")
+            self.dropped += 1
+            return None
 
     def troubles(self) -> list[str]:
         """See `Recorder`."""
@@ -275,9 +287,9 @@ class FileRecorder(Recorder):
             if change is not None:
                 before, after, cause = change
                 file.json(TRANSITIONS, now, {"t": t, "before": before, "after": after, "cause": cause})
-        for (pipe, sent), frames in _by_pipe(batch.frames).items():
-            way = "sent" if sent else "received"
-            file.raw(f"{RAW}{pipe}/{way}", self._ns(frames[0].t), b"".join([frame.data for frame in frames]))
+        for frame in batch.frames:
+            way = "sent" if frame.sent else "received"
+            file.raw(f"{RAW}{frame.pipe}/{way}", self._ns(frame.t), frame.data)
         for cycle in batch.cycles:
             now = self._ns(cycle.t)
             file.raw(FACTS, now, cycle.facts, cycle.sequence)
@@ -331,22 +343,3 @@ class FileRecorder(Recorder):
 
     def _ns(self, t: float) -> int:
         return round(self._unix(t) * 1e9)
-
-
-def _in_words(sequence: int, record: Record) -> _Cycle:
-    stamp = {"t": record.t}
-    return _Cycle(
-        sequence,
-        record.t,
-        orjson.dumps(stamp | plain(record.facts)),
-        orjson.dumps(plain(record.state)),
-        orjson.dumps(stamp | plain(record.commands)),
-    )
-
-
-def _by_pipe(frames: list[Frame]) -> dict[tuple[str, bool], list[Frame]]:
-    """Frames by pipe and direction: one message for each, since a message costs more than its bytes."""
-    found: dict[tuple[str, bool], list[Frame]] = {}
-    for frame in frames:
-        found.setdefault((frame.pipe, frame.sent), []).append(frame)
-    return found

@@ -211,6 +211,20 @@ def test_configuration_versions_and_calibration_are_in_it(tmp_path: Path) -> Non
     assert next(c for c in cycles(reader) if isinstance(c, Config)) == config
 
 
+def test_a_change_before_the_first_cycle_opens_no_file_that_knows_too_little(tmp_path: Path) -> None:
+    """Parameters may be set while the mechanics are still being loaded."""
+    made = FileRecorder(tmp_path / "r.mcap", RecordConfig(), {"format": "1"}, lambda t: t)
+    made.configure(0.0, CONFIG)
+    made.configure(0.1, CONFIG)
+    threading.Event().wait(0.3)  # the thread has looked
+    made.mechanics("numba")
+    made.put(records()[0])
+    made.close()
+    reader = Reader(tmp_path / "r.mcap")
+    assert reader.versions["mechanics"] == "numba"
+    assert sum(isinstance(found, Config) for found in cycles(reader)) == 2
+
+
 def test_a_configuration_comes_back_and_settings_over_it_are_checked() -> None:
     table = json.loads(json.dumps(as_table(CONFIG)))
     assert from_table(table, "x") == CONFIG
