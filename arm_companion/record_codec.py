@@ -114,10 +114,6 @@ def _content(value: Any) -> dict[str, Any]:
     return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
 
 
-def _is_numbers(hint: Any) -> bool:
-    return typing.get_origin(hint) is tuple and set(typing.get_args(hint)) <= {float, Ellipsis}
-
-
 def _optional(hint: Any) -> tuple[Any, bool]:
     """The type without None, and whether None was there."""
     if typing.get_origin(hint) not in (types.UnionType, typing.Union):
@@ -156,15 +152,16 @@ def _record_writer(cls: Any) -> Callable[[Any], Any]:
     infinite = ["pass"]
     for name, kind in kinds.items():
         hint, optional = _optional(kind)
+        each = _writer(hint)
         field = f"t[{name!r}]"
         present = f"if {field} is not None: " if optional else ""
-        if hint is float:
+        if each is _number:
             changes.append(f"{present}total += {field}")
             infinite.append(f"{present}{field} = number({field})")
-        elif _is_numbers(hint):
+        elif each is _numbers:
             changes.append(f"{present}total += sum({field})")
             infinite.append(f"{present}{field} = numbers({field})")
-        elif (each := _writer(hint)) != _same:
+        elif each is not _same:
             used[f"write_{name}"] = each
             changes.append(f"{present}{field} = write_{name}({field})")
     slotted = hasattr(cls, "__slots__")  # calibrations, written once in a while

@@ -334,10 +334,9 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
             return s.place(-perch.overreach_m), hurry * perch.reach_speed_m_per_s
         case Phase.VERIFY:
             return add(anchor, scale(s.ahead, -perch.verify_pull_m)), perch.verify_pull_m
-        case Phase.PERCHED:
-            return add(s.rest, s.state.offset), perch.jog_speed_m_per_s
-        case _:
-            return add(s.rest, s.state.offset), _NUDGE_M_PER_S
+        case phase:
+            speed = perch.jog_speed_m_per_s if phase is Phase.PERCHED else _NUDGE_M_PER_S
+            return add(s.rest, s.state.offset), speed
 
 
 def _rest(s: Situation) -> Vec3 | None:

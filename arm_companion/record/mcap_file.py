@@ -44,6 +44,13 @@ _MESSAGE: Final = struct.Struct("<BQHIQQ")  # opcode, length, channel, sequence,
 _BEFORE_DATA: Final = _MESSAGE.size - 9  # what counts as the message's length beside its data
 _INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, bytes of the entries
 _FOOTER: Final = struct.Struct("<BQQQ")  # opcode, length, begin of the summary, of its offsets
+_OPCODES: Final = {
+    Schema: Opcode.SCHEMA,
+    Channel: Opcode.CHANNEL,
+    Statistics: Opcode.STATISTICS,
+    ChunkIndex: Opcode.CHUNK_INDEX,
+    MetadataIndex: Opcode.METADATA_INDEX,
+}
 
 
 class McapFile:
@@ -204,15 +211,6 @@ class McapFile:
         return len(data)
 
 
-_OPCODES: Final = {
-    Schema: Opcode.SCHEMA,
-    Channel: Opcode.CHANNEL,
-    Statistics: Opcode.STATISTICS,
-    ChunkIndex: Opcode.CHUNK_INDEX,
-    MetadataIndex: Opcode.METADATA_INDEX,
-}
-
-
 class _OpenChunk:
     """Records that wait to be compressed together.
 
@@ -249,5 +247,5 @@ def _bytes(record: McapRecord) -> bytes:
 
 
 def _little(numbers: "array[int]") -> bytes:
-    """In the byte order of the file, which is that of every machine this runs on."""
+    """In the byte order of the file."""
     return struct.pack(f"<{len(numbers)}Q", *numbers)
