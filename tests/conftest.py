@@ -8,10 +8,16 @@ from arm_companion.protocol.mavlink import MavlinkCodec, Message
 from arm_companion.protocol.tunnel import unwrap
 from arm_companion.transport.base import Transport
 from arm_companion.transport.memory import MemoryPipe
+from tests.stalls import AnotherTry
 
 # the same examples in every run: what fails here has been brought in by a change. Others: --hypothesis-profile=default
 hypothesis.settings.register_profile("shared machine", deadline=None, derandomize=True)
 hypothesis.settings.load_profile("shared machine")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Real-time tests get another try when this machine stood still."""
+    config.pluginmanager.register(AnotherTry())
 
 
 class MavlinkPeer:

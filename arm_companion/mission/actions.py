@@ -145,7 +145,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
     elif _loose(s):
         state = replace(state, bend_goal=_tighter(s))
     speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
-    bend = _bend_towards(state.bend, state.bend_goal, speed * s.dt)
+    bend = _bend_towards(state.bend, state.bend_goal, speed * s.stride)
     if not s.parameters.admits(state.bend, bend):
         bend = state.bend
     pulls = state.pulls
@@ -178,7 +178,7 @@ def _loose(s: Situation) -> bool:
 def _tighter(s: Situation) -> tuple[float, float]:
     """The next goal of a wrap that bends on until it grips, up to the limit of any bend; slowly, for tension jumps."""
     theta = math.hypot(*s.state.bend)
-    step = _TIGHTEN_SHARE * s.config.perch.bend_speed_rad_per_s * s.dt
+    step = _TIGHTEN_SHARE * s.config.perch.bend_speed_rad_per_s * s.stride
     scale = min(theta + step, max(s.config.limits.bend_max_rad, theta)) / theta
     return (scale * s.state.bend[0], scale * s.state.bend[1])
 

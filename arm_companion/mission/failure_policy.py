@@ -182,7 +182,7 @@ CAUSES: tuple[Cause, ...] = (
         "cycle overrun",
         ArmFault.CYCLE_OVERRUN,
         (hazards.overrun,),
-        "nothing: a late step moves no farther than a tenth of a second allows",
+        "nothing: a late step bends the arm by two cycles, and moves nothing farther than a tenth of a second allows",
     ),
     Cause(
         "vehicle arms in a calibration",

@@ -154,6 +154,6 @@ def ground_lost(s: Situation) -> str | None:
 
 
 def overrun(s: Situation) -> str | None:
-    """This cycle came so late that it moves nothing farther than a tenth of a second allows."""
+    """This cycle came so late that nothing moves on by all the time that has passed: see `Situation.dt`, `stride`."""
     late = s.t - s.state.t if s.state.t else 0.0
     return "the control cycle is late" if late > _OVERRUN_S else None

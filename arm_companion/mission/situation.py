@@ -88,6 +88,15 @@ class Situation:
         return min(max(self.t - self.state.t, 0.0), 0.1) if self.state.t else 0.0
 
     @property
+    def stride(self) -> float:
+        """Seconds by which the arm may move on in this cycle: as `dt`, but of no more than two cycles.
+
+        Its tendons stood still while cycles were missed. Around a bar a tenth of a second of bending at one go pulls
+        them past their limit before a cycle sees the tension.
+        """
+        return min(self.dt, 2.0 / self.config.rates.cycle_hz)
+
+    @property
     def elapsed(self) -> float:
         """Seconds in the present phase."""
         return self.t - self.state.since

@@ -126,6 +126,8 @@ class FieldPageServer:
                 await self._answer(wire, request, peer)
         except Refused as refused:
             await wire.respond(refused.status, f"{refused}\n".encode())
+            if refused.status is not HTTPStatus.SERVICE_UNAVAILABLE:  # of those there may be too many to hear out
+                await wire.hear_out()
 
     async def _answer(self, wire: Wire, request: Request, peer: str) -> None:
         if not self._gate.knows_host(request.headers.get("host", "")):

@@ -12,6 +12,8 @@ REQUEST_WITHIN_S: Final = 5.0
 """A whole request has to be there by then."""
 SEND_WITHIN_S: Final = 10.0
 """A peer that takes nothing for so long is hung up on."""
+LINGER_S: Final = 1.0
+"""For so long a peer that was refused may go on sending before it is hung up on."""
 LONGEST_HEAD: Final = 8192
 LONGEST_BODY: Final = 1024
 
@@ -122,6 +124,20 @@ class Wire:
             OSError: as `respond`.
         """
         await self._send(self._http.send(h11.Data(data=data)) or b"")
+
+    async def hear_out(self) -> None:
+        """Swallow for a moment what a peer still sends: hanging up on unread bytes is a reset, which eats the answer.
+
+        Raises:
+            OSError: the peer is gone.
+        """
+        self._writer.write_eof()
+        try:
+            async with asyncio.timeout(LINGER_S):
+                while await self.reader.read(4096):
+                    pass
+        except TimeoutError:
+            pass  # it has had its moment
 
     def close(self, *, at_once: bool = False) -> None:
         """Hang up; what is not sent yet still goes out unless it is to be at once."""

@@ -2,7 +2,8 @@
 
     python -m tests.golden.thin RECORD GOLDEN [N]
 
-The orders of the cycles left out come with the next one that stays. Mechanics run on NumPy, which every machine has.
+The orders of the cycles left out come with the next one that stays, and the configuration says the lower rate.
+Mechanics run on NumPy, which every machine has.
 """
 
 import dataclasses
@@ -30,8 +31,10 @@ def thin(source: Path, target: Path, every: int) -> int:
     state, parameters, requests, count = State(), None, [], 0
     for i, cycle in enumerate(cycles(Reader(source))):
         if isinstance(cycle, Config):
-            parameters = Parameters(cycle, RodModel(ArmParameters.of(cycle.arm)))
-            file.json(CONFIGURATION, 0, {"t": 0.0, "config": as_table(cycle)})
+            rates = dataclasses.replace(cycle.rates, cycle_hz=cycle.rates.cycle_hz / every)
+            config = dataclasses.replace(cycle, rates=rates)
+            parameters = Parameters(config, RodModel(ArmParameters.of(config.arm)))
+            file.json(CONFIGURATION, 0, {"t": 0.0, "config": as_table(config)})
             continue
         requests += cycle.facts.requests
         if i % every:

@@ -100,6 +100,7 @@ def test_the_screen_follows_a_broker(tmp_path: Path) -> None:
     assert {line.split()[0] for line in told.splitlines()} == {"1", "2"}
 
 
+@pytest.mark.scenario
 @pytest.mark.realtime
 def test_two_vehicles_that_fly_at_once_are_both_on_the_screen(tmp_path: Path) -> None:
     wanted = {"online", "STOWED", "READY", "APPROACH"}  # in the air; the perch itself wants a machine for itself

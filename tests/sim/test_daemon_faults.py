@@ -1,5 +1,6 @@
-"""The daemon when its own cycle fails: the arm holds, the link lives, and people are told."""
+"""The daemon when its own cycle fails or is late: the arm holds, the link lives, and people are told."""
 
+import asyncio
 from typing import Any
 
 import pytest
@@ -7,6 +8,8 @@ import pytest
 from arm_companion import app
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
+from arm_companion.mission.facts import Facts
+from arm_companion.mission.state import Phase
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.world import World
 from arm_companion.supervisor import ServiceManager
@@ -43,3 +46,25 @@ def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest
     assert after.t - before.t > 0.25, "the cycle goes on after the failure"
     assert [t.pull for t in after.facts.tendons] == pytest.approx([t.pull for t in before.facts.tendons], abs=5e-4)
     assert all(t.torque and t.ready for t in after.facts.tendons), "the arm held, and follows again"
+
+
+@pytest.mark.scenario
+def test_cycles_that_come_late_again_and_again_overstress_no_tendon_around_a_bar(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    config = load("sim.toml")
+    real, stalls = app.Daemon._observe, [0.0]
+
+    async def late(daemon: app.Daemon) -> Facts:
+        now = asyncio.get_running_loop().time()
+        if daemon._state.phase in {Phase.CONTACT, Phase.WRAP, Phase.VERIFY} and now - stalls[-1] > 0.45:
+            stalls.append(now)
+            await asyncio.sleep(0.2)
+        return await real(daemon)
+
+    monkeypatch.setattr(app.Daemon, "_observe", late)
+    result = run_simulated(fly_simulated(config, lambda _: None))
+    assert len(stalls) > 20
+    assert result.failure == ""
+    tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
+    assert tension <= config.limits.tension_max_n

@@ -149,6 +149,7 @@ def _visit(place: str) -> None:
             assert done.returncode == 0, words
 
 
+@pytest.mark.scenario
 @pytest.mark.realtime
 def test_a_reader_with_a_world_on_the_desk(place: Path) -> None:
     here = "from tests.sim.test_documented_commands import _visit; import sys; _visit(sys.argv[1])"
@@ -177,6 +178,7 @@ def _look(place: str) -> None:
     assert "refused" not in log
 
 
+@pytest.mark.scenario
 @pytest.mark.realtime
 def test_a_reader_with_a_vision_process(place: Path) -> None:
     here = "from tests.sim.test_documented_commands import _look; import sys; _look(sys.argv[1])"

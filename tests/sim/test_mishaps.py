@@ -118,6 +118,7 @@ def test_a_perch_that_is_aborted_lets_go_in_whatever_state_it_is() -> None:
     assert "APPROACH" not in touched
 
 
+@pytest.mark.scenario
 def test_an_abort_in_mid_air_ends_at_home() -> None:
     config = load("sim.toml", ("sim.seed=6",))
     assert ABORTED_IN[6 % len(ABORTED_IN)] == "APPROACH"

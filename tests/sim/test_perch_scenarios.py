@@ -168,6 +168,7 @@ def test_the_record_has_every_cycle_every_frame_and_every_sentence() -> None:
     assert {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= {message.get_type() for message in heard}
 
 
+@pytest.mark.scenario
 def test_a_bar_ten_centimetres_out_of_reach_is_reported_and_the_vehicle_comes_home() -> None:
     def away(world: World) -> None:
         x, y, z = CONFIG.sim.bar.position_m
