@@ -57,28 +57,30 @@ class Timesync:
         self._link = link
         self._clock = clock
         self._trips: deque[_Trip] = deque(maxlen=WINDOW)
+        self._best: _Trip | None = None  # which one it is does not change with time: all bounds grow alike
         self._asked: deque[int] = deque(maxlen=8)
         link.subscribe(self._on_timesync, (mav.MAVLINK_MSG_ID_TIMESYNC,))
 
     @property
     def error_s(self) -> float:
         """Greatest error of a time that is taken over from the autopilot; inf before the first answer."""
-        best = self._best()
+        best = self._best
         return float("inf") if best is None else self._bound(best)
 
     def loop_time(self, autopilot_s: float) -> float | None:
         """Our loop's time of an instant of the autopilot's clock (s since its boot); None while it is not known."""
-        best = self._best()
+        best = self._best
         return None if best is None else autopilot_s - best.offset_s
 
     def autopilot_time(self, loop_s: float) -> float | None:
         """The autopilot's time (s since its boot) of an instant of our loop; None while it is not known."""
-        best = self._best()
+        best = self._best
         return None if best is None else loop_s + best.offset_s
 
     def forget(self) -> None:
         """The autopilot has booted anew: its clock is another one."""
         self._trips.clear()
+        self._best = None
         self._asked.clear()
 
     async def run(self) -> None:
@@ -88,9 +90,6 @@ class Timesync:
             self._asked.append(now)
             self.counters.asked += 1
             self._link.send(mav.MAVLink_timesync_message(0, now), Priority.NOW)  # waiting would spoil it
-
-    def _best(self) -> _Trip | None:
-        return min(self._trips, key=self._bound, default=None)
 
     def _bound(self, trip: _Trip) -> float:
         return trip.error_s + DRIFT * (self._clock.now() - trip.at)
@@ -110,8 +109,9 @@ class Timesync:
             return
         self.counters.answered += 1
         trip = _Trip(now, message.tc1 * _NS - (sent + now) / 2.0, (now - sent) / 2.0)
-        best = self._best()
+        best = self._best
         if best is not None and abs(trip.offset_s - best.offset_s) > trip.error_s + self._bound(best):
             self.counters.jumps += 1
             self._trips.clear()
         self._trips.append(trip)
+        self._best = min(self._trips, key=self._bound)
