@@ -1,6 +1,5 @@
 """The rod on compiled equations (extra `fast`); importing this module compiles them, or reads numba's cache."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +13,7 @@ from arm_companion.arm.rod_solver import (
     STEP_LIMIT,
     TOLERANCE,
     TOO_SHARP,
+    BareEnds,
     Problem,
     Solved,
     Support,
@@ -25,16 +25,6 @@ from arm_companion.geometry.arrays import Array
 _NOTHING = np.zeros(30)
 _NONE_HUNG = np.zeros((0, 6))
 _NO_TANGENT = np.zeros((0, 0))
-
-
-@dataclass(eq=False, slots=True)
-class _Ends:
-    """See `rod_solver.Ends`."""
-
-    tip: Array
-    R_tip: Array
-    base_wrench: Array
-    tension: Array
 
 
 class FastRod(Rod):
@@ -115,7 +105,7 @@ class FastRod(Rod):
         )
         if status != 0:
             return TOO_SHARP if status == 2 else NO_CONVERGENCE
-        reached = _Ends(ends[:3], ends[3:12].reshape(3, 3), ends[12:18], ends[18:])
+        reached = BareEnds(ends[:3], ends[3:12].reshape(3, 3), ends[12:18], ends[18:])
         # Stiffened only so far, an unstable verdict may be wrong: then it is left to the exact test.
         verdict = True if stable else None
         held = None if support is None else C

@@ -12,6 +12,7 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
 from arm_companion.arm.rod_equations import Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
+from arm_companion.arm.rod_start import RodStart
 from arm_companion.arm.unloaded import UnloadedArm
 from arm_companion.errors import LimitViolated, ModelError, NoSolution
 from arm_companion.geometry import so3
@@ -113,6 +114,11 @@ class RodModel(UnloadedArm):
         q = frozen(pull, (self._parameters.n,), "pull")
         detail = self._held(q, hold, gravity, tension, start)
         return _solution(detail, q, detail.rod.s - _norm(detail.solved.ends.tip))
+
+    def resumed(self, start: RodStart) -> ArmSolution:
+        """A solution of this model that was written down, with all that it could tell."""
+        detail = start.solved(self._rod(start.arc_length, start.level))
+        return _solution(detail, np.array(start.pull), start.taut_margin)
 
     def _held(
         self, pull: Array, hold: Hold, gravity: ArrayLike, tension: ArrayLike | None, start: ArmSolution | None

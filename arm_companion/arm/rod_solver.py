@@ -154,6 +154,16 @@ class Ends(Protocol):
         """Of the tendons (n,), N."""
 
 
+@dataclass(eq=False, slots=True)
+class BareEnds:
+    """`Ends` and nothing else; the whole state can be worked out again."""
+
+    tip: Array
+    R_tip: Array
+    base_wrench: Array
+    tension: Array
+
+
 @dataclass(eq=False)
 class Solved:
     """An equilibrium.

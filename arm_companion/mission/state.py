@@ -124,7 +124,7 @@ class Prediction:
     bend: tuple[float, float]  # rad, that the measured displacements stand for
     lean: Vec3  # m/s^2, world: the acceleration that holds the reference against the arm
     tensions: tuple[Expected, ...] = ()  # what the statics say of each tendon; empty when they say nothing
-    # where the next solves start; they follow from what was recorded before, so they are not recorded themselves
+    # where the next solves start; they follow from what was recorded before, so they are recorded once in a while
     free: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
     anchored: ArmSolution | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)
     stiffness: StiffnessReport | None = field(default=None, compare=False, repr=False, metadata=UNRECORDED)

@@ -23,12 +23,14 @@ from arm_companion.mission.facts import Notice
 from arm_companion.record import storage
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.recorder import Frame, Record, Recorder
+from arm_companion.record.starts import starts_text
 from arm_companion.record.topics import (
     COMMANDS,
     CONFIGURATION,
     FACTS,
     LOG,
     RAW,
+    STARTS,
     STATE,
     TRANSITIONS,
     log_message,
@@ -42,6 +44,8 @@ _TOGETHER: Final = 10
 """Cycles that are put into words at once: half a millisecond of the last one's time."""
 _QUEUE: Final = 100
 """Batches of so many cycles that wait for the disk: five seconds at 200 Hz."""
+_STARTS_S: Final = 10.0
+"""So often does it stand in the record where the solver starts."""
 _SYNC_S: Final = 2.0
 _RETRY_S: Final = 10.0
 _RAW_S: Final = 1.0
@@ -63,6 +67,7 @@ class _Cycle(NamedTuple):
     facts: bytes
     state: bytes
     commands: bytes
+    starts: bytes
 
 
 @dataclass(slots=True)
@@ -117,6 +122,7 @@ class FileRecorder(Recorder):
         self._batch = _Batch()
         self._records: list[Record] = []
         self._sequence = 0
+        self._starts_at = float("-inf")
         self._raw_left = 0.0
         self._raw_since = float("-inf")
         self._raw_lost = False
@@ -176,7 +182,7 @@ class FileRecorder(Recorder):
             self._hurry.set()
             self._breath.wait(_BREATH_S)
         if len(self._queue) >= _QUEUE:
-            self.dropped += len(records)
+            self._lose(len(records))
             self._batch.notices = self._batch.notices[-100:]  # they are small, and without configurations no replay
             self._batch.frames.clear()
             if not self._slow:
@@ -199,11 +205,24 @@ class FileRecorder(Recorder):
                 orjson.dumps(stamp | plain(record.facts)),
                 orjson.dumps(plain(record.state)),
                 orjson.dumps(stamp | plain(record.commands)),
+                self._starts(record),
             )
         except Exception:
             log.exception("record: a cycle could not be put into words")
-            self.dropped += 1
+            self._lose(1)
             return None
+
+    def _starts(self, record: Record) -> bytes:
+        """Where the solver starts in this cycle, when that is due."""
+        if record.state.prediction is None or 0.0 <= record.t - self._starts_at < _STARTS_S:
+            return b""
+        self._starts_at = record.t
+        return starts_text(record.state, record.t)
+
+    def _lose(self, cycles: int) -> None:
+        """Count cycles that will be missing; a replay can go on behind them from the next start."""
+        self.dropped += cycles
+        self._starts_at = float("-inf")
 
     def troubles(self) -> list[str]:
         """See `Recorder`."""
@@ -246,7 +265,7 @@ class FileRecorder(Recorder):
                 self._fail(batch, error)
             except Exception:
                 log.exception("record: cycles could not be written")
-                self.dropped += len(batch.cycles)
+                self._lose(len(batch.cycles))
             if batch.last:
                 return True
             if behind:  # leave the interpreter to the cycle
@@ -261,7 +280,7 @@ class FileRecorder(Recorder):
             return
         if self._file is None:
             if t < self._retry_at:
-                self.dropped += len(batch.cycles)
+                self._lose(len(batch.cycles))
                 return
             self._next_part(t)
         file = self._file
@@ -292,6 +311,8 @@ class FileRecorder(Recorder):
             file.raw(f"{RAW}{frame.pipe}/{way}", self._ns(frame.t), frame.data)
         for cycle in batch.cycles:
             now = self._ns(cycle.t)
+            if cycle.starts:
+                file.raw(STARTS, now, cycle.starts, cycle.sequence)
             file.raw(FACTS, now, cycle.facts, cycle.sequence)
             file.raw(STATE, now, cycle.state, cycle.sequence)
             file.raw(COMMANDS, now, cycle.commands, cycle.sequence)
@@ -322,7 +343,7 @@ class FileRecorder(Recorder):
             raise OSError(f"less than {options.keep_free_mb:g} MB are free")
 
     def _fail(self, batch: _Batch, error: OSError) -> None:
-        self.dropped += len(batch.cycles)
+        self._lose(len(batch.cycles))
         if self._file is not None:
             self._file.abandon()
             self._file = None

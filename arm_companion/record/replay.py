@@ -20,7 +20,8 @@ from arm_companion.mission.mission import step
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record.reader import Item, Reader
-from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, STATE, transition
+from arm_companion.record.starts import started
+from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, STARTS, STATE, transition
 from arm_companion.record_codec import build, plain
 
 Change = Callable[[Config], Config]
@@ -40,6 +41,8 @@ class Written(NamedTuple):
     facts: bytes
     state: bytes
     commands: bytes
+    starts: bytes = b""
+    """Where the solver starts, which stands with one cycle now and then."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +54,7 @@ class Cycle:
     facts: Facts
     state: bytes
     commands: bytes
+    starts: bytes = b""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,13 +168,16 @@ def written(reader: Reader) -> Iterator[Written | Config]:
         ConfigError: a configuration is not what this version knows.
     """
     parts: dict[str, Item] = {}
-    for item in reader.messages((FACTS, STATE, COMMANDS, CONFIGURATION)):
+    for item in reader.messages((FACTS, STATE, COMMANDS, CONFIGURATION, STARTS)):
         if item.topic == CONFIGURATION:
             yield from_table(orjson.loads(item.data)["config"], f"configuration of {reader.path.name}")
             continue
         parts[item.topic] = item
         if item.topic == COMMANDS and FACTS in parts and parts[FACTS].sequence == item.sequence:
-            yield Written(item.sequence, parts[FACTS].data, parts[STATE].data if STATE in parts else b"", item.data)
+            state = parts[STATE].data if STATE in parts else b""
+            begin = parts.pop(STARTS, None)
+            starts = begin.data if begin is not None and begin.sequence == item.sequence else b""
+            yield Written(item.sequence, parts[FACTS].data, state, item.data, starts)
 
 
 def cycle_of(text: Written) -> Cycle:
@@ -181,7 +188,7 @@ def cycle_of(text: Written) -> Cycle:
     """
     table = orjson.loads(text.facts)
     t = float(table.pop("t"))
-    return Cycle(text.number, t, build(Facts, table), text.state, text.commands)
+    return Cycle(text.number, t, build(Facts, table), text.state, text.commands, text.starts)
 
 
 class Runner:
@@ -220,7 +227,7 @@ class Runner:
         if self.parameters is None:
             raise RecordError("the record has no configuration before its first cycle")
         if self.state is None or cycle.number != self._next:
-            self._resume(cycle)
+            self._resume(cycle, self.parameters)
         self._next = cycle.number + 1
         outcome.cycles += 1
         seconds = outcome.seconds = cycle.t - self.start
@@ -242,25 +249,23 @@ class Runner:
             return
         self._compare(cycle, orjson.loads(cycle.commands), orjson.loads(now), seconds)
 
-    def resume(self, state: State, number: int) -> None:
-        """Go on at this cycle with other memory."""
-        self.state, self._next = state, number
-
-    def _resume(self, cycle: Cycle) -> None:
+    def _resume(self, cycle: Cycle, parameters: Parameters) -> None:
         """Memory as recorded: at the first cycle, and where some are missing."""
         if self.state is None:
-            self.start = cycle.t
+            self.start = self.start or cycle.t
             if cycle.number:
                 self._outcome.remarks.append(f"its first {cycle.number} cycles are missing")
         else:
             self._outcome.gaps.append((self._next, cycle.number - self._next))
         try:
             self.state = build(State, orjson.loads(cycle.state)) if cycle.state else self.state or State()
+            if cycle.starts:
+                self.state = started(self.state, cycle.starts, parameters.model)
         except ValueError as error:
             raise RecordError(f"cycle {cycle.number}: memory of another version: {error}") from None
-        if cycle.number and self.state.prediction is not None:
+        if cycle.number and self.state.prediction is not None and not cycle.starts:
             self._outcome.why.append(
-                "cycles are missing: where the solver starts is not recorded, so last bits may differ after the gap"
+                "cycles are missing, and where the solver starts behind them: last bits may differ after the gap"
             )
 
     def _compare(self, cycle: Cycle, recorded: dict[str, Any], now: dict[str, Any], seconds: float) -> None:

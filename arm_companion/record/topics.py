@@ -23,6 +23,8 @@ METADATA: Final = "arm_companion"
 FACTS: Final = "/facts"
 STATE: Final = "/state"
 COMMANDS: Final = "/commands"
+STARTS: Final = "/starts"
+"""Where the solver starts from in the cycle of the same number, once in a while."""
 TRANSITIONS: Final = "/transitions"
 LOG: Final = "/log"
 CONFIGURATION: Final = "/configuration"
@@ -72,6 +74,10 @@ SCHEMAS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     # the state's own `t` is that of the step before
     STATE: ("arm_companion.State", schema(State)),
     COMMANDS: ("arm_companion.Commands", _timed(schema(Commands))),
+    STARTS: (
+        "arm_companion.Starts",
+        _timed({"properties": {name: {"type": "object"} for name in ("free", "anchored", "stiffness")}}),
+    ),
     TRANSITIONS: (
         "arm_companion.Transition",
         _timed({"properties": {"before": _STRING, "after": _STRING, "cause": _STRING}}),

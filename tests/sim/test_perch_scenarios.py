@@ -16,6 +16,7 @@ from arm_companion.mission.state import State
 from arm_companion.protocol.mavlink import MavlinkCodec
 from arm_companion.record.reader import Item, Reader
 from arm_companion.record.replay import replay
+from arm_companion.record.shares import share, stretches
 from arm_companion.record.topics import COMMANDS, FACTS, LOG, RAW, STATE, TRANSITIONS
 from arm_companion.record_codec import dumps, loads
 from arm_companion.sim.asked import asked
@@ -147,6 +148,10 @@ def test_no_cycle_is_missed_and_replay_gives_the_same_commands_bit_for_bit() -> 
     assert outcome.cycles == len(result.records)
     assert not outcome.remarks
     assert not outcome.gaps
+    parts = [share(log(), "", stretch) for stretch in stretches(outcome.cycles, 3)]
+    assert None not in parts, "from where the solver's starts are recorded it comes out the same"
+    assert min(part.cycles for part in parts if part) > 0.2 * outcome.cycles
+    assert sum(part.cycles for part in parts if part) == outcome.cycles
 
 
 def test_the_record_has_every_cycle_every_frame_and_every_sentence() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import re
+from collections.abc import Collection
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -24,12 +25,14 @@ from arm_companion.record import shares
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.reader import Reader, truth_beside
 from arm_companion.record.replay import differences, replay
+from arm_companion.record.starts import starts_text
 from arm_companion.record.topics import (
     COMMANDS,
     CONFIGURATION,
     FACTS,
     FORMAT,
     LOG,
+    STARTS,
     STATE,
     TRANSITIONS,
     TRUTH,
@@ -98,27 +101,42 @@ def test_a_gap_is_told_and_replay_goes_on_behind_it(tmp_path: Path) -> None:
     assert outcome.cycles == 35
 
 
-def remembered(target: Path, cycles: int, *, spoilt: int | None = None) -> None:
-    """The golden flight's beginning with the memory before every cycle, as the daemon writes it.
+def remembered(
+    target: Path,
+    cycles: int,
+    *,
+    spoilt: int | None = None,
+    other_start: int | None = None,
+    missing: Collection[int] = (),
+) -> None:
+    """The golden flight's beginning with the memory before every cycle, and the solver's start with every twentieth.
 
     Args:
         target: written.
         cycles: how many.
         spoilt: the cycle whose commands are not those that follow.
+        other_start: the cycle with which an earlier solution stands.
+        missing: cycles that are left out.
     """
     reader = Reader(GOLDEN)
     file = McapFile(target, reader.versions)
-    state, parameters = State(), None
+    state, first, parameters = State(), State(), None
     for found in itertools.islice(replay_module.cycles(reader), cycles + 1):
         if isinstance(found, Config):
             parameters = Parameters(found, RodModel(ArmParameters.of(found.arm)))
             file.json(CONFIGURATION, 0, {"t": 0.0, "config": as_table(found)})
             continue
         assert parameters is not None
-        file.json(STATE, 0, plain(state), found.number)
+        before, first = state, state if first.prediction is None else first
         state, commands = mission.step(state, found.facts, found.t, parameters)
         if found.number == spoilt:
             commands = dataclasses.replace(commands, recover=True)
+        if found.number in missing:
+            continue
+        if before.prediction is not None and not found.number % 20:
+            start = first if found.number == other_start else before
+            file.raw(STARTS, 0, starts_text(start, found.t), found.number)
+        file.json(STATE, 0, plain(before), found.number)
         file.json(FACTS, 0, {"t": found.t} | plain(found.facts), found.number)
         file.json(COMMANDS, 0, {"t": found.t} | plain(commands), found.number)
     file.close()
@@ -132,10 +150,36 @@ def test_shares_are_together_the_whole_replay(tmp_path: Path) -> None:
     count = Reader(path).count(FACTS)
     assert count == 150
     parts = [shares.share(path, "", stretch) for stretch in shares.stretches(count, 3)]
-    assert [part and part.cycles for part in parts] == [67, 48, 35]
+    assert [part and part.cycles for part in parts] == [60, 40, 50], "from where a start is recorded"
     moves = [move for part in parts if part is not None for move in part.recorded]
     assert sorted(moves, key=lambda move: move.seconds) == whole.recorded
     assert {move.after for move in moves} >= {"STOWED", "READYING", "READY"}
+
+
+def test_a_start_that_is_not_what_comes_out_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    remembered(path, 90, other_start=60)
+    assert shares.share(path, "", (0, 40)) is not None
+    assert shares.share(path, "", (0, 60)) is None, "the next one would start from elsewhere"
+    assert replay(Reader(path)).identical, "and one go does not need it"
+
+
+def test_behind_a_gap_it_goes_on_from_a_recorded_start_bit_for_bit(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    remembered(path, 90, missing=range(45, 60))
+    outcome = replay(Reader(path))
+    assert outcome.gaps == [(45, 15)]
+    assert outcome.identical
+    assert outcome.cycles == 75
+    remembered(path, 90, missing=range(45, 59))
+    told = replay_module.Outcome()
+    runner = replay_module.Runner(told, None, fast=False)
+    for found in replay_module.cycles(Reader(path)):
+        if isinstance(found, Config):
+            runner.configure(found)
+        else:
+            runner.take(found)
+    assert "last bits may differ" in " ".join(told.why), "no start stands with the next one"
 
 
 @pytest.mark.parametrize("spoilt", [10, 60])
@@ -144,8 +188,13 @@ def test_a_share_that_finds_a_difference_says_nothing(tmp_path: Path, spoilt: in
     remembered(path, 90, spoilt=spoilt)
     whose = (0, 40) if spoilt < 40 else (40, 90)
     assert shares.share(path, "", whose) is None
-    copy(path, upto=90)  # without memory
-    assert None in [shares.share(path, "", stretch) for stretch in ((0, 40), (40, 90))]
+
+
+def test_where_no_start_is_recorded_one_share_is_all_of_it(tmp_path: Path) -> None:
+    path = tmp_path / "r.mcap"
+    copy(path, upto=90)
+    parts = [shares.share(path, "", stretch) for stretch in ((0, 40), (40, 90))]
+    assert [part and part.cycles for part in parts] == [90, 0]
 
 
 def test_what_another_configuration_would_have_done(capsys: pytest.CaptureFixture[str]) -> None:
