@@ -1,6 +1,7 @@
 """The daemon when its own cycle fails or is late: the arm holds, the link lives, and people are told."""
 
 import asyncio
+import random
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.state import Phase
+from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.world import World
 from arm_companion.supervisor import ServiceManager
@@ -66,5 +68,30 @@ def test_cycles_that_come_late_again_and_again_overstress_no_tendon_around_a_bar
     result = run_simulated(fly_simulated(config, lambda _: None))
     assert len(stalls) > 20
     assert result.failure == ""
+    tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
+    assert tension <= config.limits.tension_max_n
+
+
+@pytest.mark.scenario
+@pytest.mark.parametrize(("scenario", "name"), [("hang", "sim_hang.toml"), ("grasp", "sim_grasp.toml")])
+def test_a_computer_that_stands_still_every_other_second_hangs_and_grasps_all_the_same(
+    monkeypatch: pytest.MonkeyPatch, scenario: str, name: str
+) -> None:
+    config = load(name)
+    real, chance, stalls = app.Daemon._observe, random.Random(1), [0.0]
+
+    async def late(daemon: app.Daemon) -> Facts:
+        now = asyncio.get_running_loop().time()
+        if now > stalls[-1] and daemon._state.phase is not Phase.STARTUP:
+            stalls.append(now + chance.uniform(1.0, 3.0))
+            await asyncio.sleep(chance.uniform(0.15, 0.3))
+        return await real(daemon)
+
+    monkeypatch.setattr(app.Daemon, "_observe", late)
+    plan = SCENARIOS[scenario]
+    result = run_simulated(fly_simulated(config, lambda _: None, fly=plan.fly))
+    assert len(stalls) > 40
+    verdict = plan.judge(result.flight, result.failure, config)
+    assert verdict.success, verdict.verdict
     tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
     assert tension <= config.limits.tension_max_n
