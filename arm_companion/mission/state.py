@@ -145,6 +145,7 @@ class Vigil:
         hot_s: a servo is close to its temperature limit.
         low_s: the supply is close to its lower limit.
         slack_s: a tendon is surely under its least tension.
+        tight_s: a tendon reads more than its greatest tension.
         blind_s: the mechanics have no solution.
         shift: sum of the jumps of the estimator, m.
         jumped_at: loop time of the last jump.
@@ -157,6 +158,7 @@ class Vigil:
     hot_s: float = 0.0
     low_s: float = 0.0
     slack_s: float = 0.0
+    tight_s: float = 0.0
     blind_s: float = 0.0
     shift: Vec3 = ZERO
     jumped_at: float = 0.0

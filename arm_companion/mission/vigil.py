@@ -47,6 +47,7 @@ def keep_vigil(s: Situation) -> State:
             before.slack_s,
             holds=any(t.torque and t.tension + 2.0 * t.tension_sigma < limits.tension_min_n for t in heard),
         ),
+        tight_s=time(before.tight_s, holds=any(t.tension > limits.tension_max_n for t in heard)),
         blind_s=time(before.blind_s, holds=_blind(s)),
     )
     return replace(state, vigil=vigil)

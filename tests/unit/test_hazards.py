@@ -4,6 +4,8 @@ import dataclasses
 import math
 from collections.abc import Callable
 
+import pytest
+
 from arm_companion.mission import hazards
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.situation import Parameters, Situation
@@ -31,11 +33,16 @@ def test_a_slack_tendon_is_named(parameters: Parameters, hovering: Hovering) -> 
     assert hazards.slack(s) == "tendon 3 slack: -9.0 N"
 
 
-def test_a_tendon_may_carry_its_limit_and_no_more(parameters: Parameters, hovering: Hovering) -> None:
-    limit = parameters.config.limits.tension_max_n
-    for tension, told in ((limit, False), (limit + 0.1, True)):
-        s = Situation(memory(Phase.PERCHED), tendon(1, tension=tension)(hovering()), T0, parameters)
-        assert (hazards.overstressed(s) is not None) is told
+@pytest.mark.parametrize(
+    ("share", "for_s", "told"),
+    [(1.0, 9.0, False), (1.01, 0.09, False), (1.01, 0.11, True), (1.14, 0.0, False), (1.16, 0.0, True)],
+)
+def test_a_tendon_may_carry_its_limit_and_more_for_a_jerk_but_never_much_more(
+    parameters: Parameters, hovering: Hovering, share: float, for_s: float, told: bool
+) -> None:
+    facts = tendon(1, tension=share * parameters.config.limits.tension_max_n)(hovering())
+    s = Situation(memory(Phase.PERCHED, vigil=Vigil(tight_s=for_s)), facts, T0, parameters)
+    assert (hazards.overstressed(s) is not None) is told
 
 
 def test_a_ground_station_is_lost_only_after_it_was_heard(parameters: Parameters, hovering: Hovering) -> None:

@@ -15,7 +15,7 @@ from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Change, gripping, jaws
 
 Hovering = Callable[..., Facts]
 LEAP = (0.0, 1.0, 0.5)
-LASTED = Vigil(position_w=PLACE, astray_s=0.4, hot_s=0.4, low_s=0.4, slack_s=0.4, blind_s=0.4)
+LASTED = Vigil(position_w=PLACE, astray_s=0.4, hot_s=0.4, low_s=0.4, slack_s=0.4, tight_s=0.4, blind_s=0.4)
 
 
 def kept(state: State, facts: Facts, parameters: Parameters) -> State:
@@ -32,6 +32,7 @@ def kept(state: State, facts: Facts, parameters: Parameters) -> State:
         ("hot_s", tendon(2, temperature=80.0)),
         ("low_s", tendon(2, voltage=1.0)),
         ("slack_s", tendon(2, tension=-9.0)),
+        ("tight_s", tendon(1, tension=45.1)),
         ("astray_s", moved((0.0, 0.51, 0.0))),
     ],
 )
@@ -41,7 +42,7 @@ def test_a_timer_runs_while_its_fact_holds_and_starts_anew_once_it_does_not(
     # the vehicle was there in the cycle before, so that it has not jumped
     bad = change(hovering())
     state = memory(Phase.APPROACH, vigil=dataclasses.replace(LASTED, position_w=bad.vehicle.position_w))
-    timers = {"astray_s", "hot_s", "low_s", "slack_s", "blind_s"}
+    timers = {"astray_s", "hot_s", "low_s", "slack_s", "tight_s", "blind_s"}
     after = kept(state, bad, parameters).vigil
     assert getattr(after, timer) == pytest.approx(0.4 + DT)
     assert all(getattr(after, other) == 0.0 for other in timers - {timer})
