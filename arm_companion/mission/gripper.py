@@ -44,6 +44,17 @@ def begin(s: Situation) -> State:
     return state
 
 
+def settled(before: State, s: Situation) -> State:
+    """Memory once this cycle's phase stands: what one that was left at once had ordered, the jaws are not told.
+
+    A person says RELEASE in the cycle in which the motors stop: the arm holds on, and so do the jaws.
+    """
+    grip = s.state.grip
+    if grip.order == before.grip.order or s.state.phase in _ORDERS:
+        return s.state
+    return replace(s.state, grip=replace(grip, order=before.grip.order, held_s=before.grip.held_s))
+
+
 def touching(s: Situation) -> State:
     """Memory at the entry of CONTACT: the vehicle stays where the object is between the jaws, or under them."""
     reference = s.state.reference

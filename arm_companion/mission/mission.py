@@ -64,6 +64,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         situation = _obey(situation, request, answers, notices)
     situation = situation.remembering(follow_stream(situation, notices))
     situation = _move_on(situation, answers, notices)
+    situation = situation.remembering(gripper.settled(state, situation))
     recover = _begins_clearing(situation)
     situation = _finish_clearing(situation, answers)
     state, arm, pulls = actions.act(situation)

@@ -382,6 +382,21 @@ def test_the_jaws_open_once_the_load_is_off_and_only_then_does_the_vehicle_leave
     assert run.said[-1].setpoint.position_w[2] < PLACE[2], "straight up"
 
 
+def test_a_release_in_the_cycle_in_which_the_motors_stop_opens_nothing(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(memory(Phase.HOLDING, armed=True, grip=CLOSED), parameters)
+    stopped = vehicle(armed=False)(jaws(**HOLDS)(hovering()))
+    commands = run.cycle(ask(stopped, Order.RELEASE))
+    assert run.phases == [Phase.HOLDING]
+    assert any("RELEASE -> HOLDING" in text for text in run.texts), "it had begun"
+    assert commands.gripper == CLOSED.order
+    commands = run.cycle(ask(stopped, Order.RELEASE, request=8))
+    assert run.state.phase is Phase.RELEASE
+    assert commands.gripper is not None
+    assert commands.gripper.action is GripperAction.OPEN, "said again of motors that stand, it counts"
+
+
 def test_jaws_that_do_not_open_end_in_holding(parameters: Parameters, hovering: Hovering) -> None:
     run = Run(held(Phase.RELEASE, grip=OPENED, since=T0 - 29.0), parameters)
     run.cycles(jaws(closed=0.7)(hovering()), 2.0)
