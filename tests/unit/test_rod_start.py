@@ -5,7 +5,6 @@ import json
 import numpy as np
 import pytest
 
-from arm_companion.arm import compiled
 from arm_companion.arm.arc_model import ArcModel
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters
@@ -21,16 +20,10 @@ WOUND = np.array((0.02, 0.004, -0.019, 0.0))
 PAYLOAD = Payload(0.2, np.array((0.01, 0.0, 0.03)))
 
 
-def models() -> list[str]:
-    try:
-        compiled.load(compiling=True)
-    except compiled.NotCompiled:
-        return ["numpy"]
-    return ["numpy", "numba"]
-
-
-@pytest.fixture(params=models())
+@pytest.fixture(params=["numpy", "numba"])
 def model(request: pytest.FixtureRequest) -> RodModel:
+    if request.param == "numba":
+        pytest.importorskip("numba")
     return RodModel(ARM, fast=request.param == "numba")
 
 
