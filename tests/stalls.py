@@ -8,6 +8,7 @@ machine that keeps time every failure counts.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -24,7 +25,7 @@ LONG_STALL_S = 0.1
 """The daemon calls its own cycle late from here on; a test that meets that in every try is skipped."""
 TRIES = 3
 
-_SLEEPER = """
+_SLEEPER = r"""
 import os, sys, time
 os.sched_setaffinity(0, {int(sys.argv[1])})
 parent = os.getppid()
@@ -32,7 +33,7 @@ while os.getppid() == parent:
     begun = time.monotonic()
     time.sleep(0.01)
     if (late := time.monotonic() - begun - 0.01) > float(sys.argv[2]):
-        print(begun, late, flush=True)
+        os.write(1, f"{begun} {late}\n".encode())
 """
 
 
@@ -40,24 +41,25 @@ class Sleepers:
     """One process a processor, which tells when it woke up late."""
 
     def __init__(self) -> None:
-        with tempfile.NamedTemporaryFile(prefix="stalls", delete=False) as file:
-            self._told = Path(file.name)
-            self._processes = [
-                subprocess.Popen([sys.executable, "-S", "-c", _SLEEPER, str(cpu), str(STALL_S)], stdout=file)
-                for cpu in sorted(os.sched_getaffinity(0))
-            ]
+        self._folder = Path(tempfile.mkdtemp(prefix="stalls"))
+        self._processes = []
+        for cpu in sorted(os.sched_getaffinity(0)):
+            words = [sys.executable, "-S", "-c", _SLEEPER, str(cpu), str(STALL_S)]
+            with (self._folder / str(cpu)).open("wb") as told:  # one each: two that write into one tear lines
+                self._processes.append(subprocess.Popen(words, stdout=told))
 
     def longest(self, since: float) -> float:
         """The longest that a processor was away since a time of the monotonic clock, s."""
-        late = (line.split() for line in self._told.read_text(encoding="ascii").splitlines())
-        return max((float(words[1]) for words in late if len(words) == 2 and float(words[0]) >= since), default=0.0)
+        lines = [line for told in self._folder.iterdir() for line in told.read_text(encoding="ascii").splitlines(True)]
+        whole = [line.split() for line in lines if line.endswith("\n")]
+        return max((float(late) for begun, late in whole if float(begun) >= since), default=0.0)
 
     def stop(self) -> None:
         """End them."""
         for process in self._processes:
             process.kill()
             process.wait()
-        self._told.unlink()
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class AnotherTry:

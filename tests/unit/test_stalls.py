@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
 import tests
+from tests import stalls
 
 _CONFTEST = """
 from tests import stalls
@@ -67,3 +69,23 @@ def test_a_failure_counts_unless_the_machine_stood_still(
     assert outcomes in run.stdout.splitlines()[-1], run.stdout
     assert said in run.stdout
     assert "the reason" in run.stdout, "what is let off says what it was"
+
+
+def test_every_sleeper_is_understood_while_all_of_them_tell(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONUNBUFFERED", "1")  # `print` then writes each word by itself
+    monkeypatch.setattr(stalls, "STALL_S", -1.0)  # tell every time
+    begun = time.monotonic()
+    sleepers = stalls.Sleepers()
+    try:
+        until = begun + 20.0
+        while (longest := sleepers.longest(begun)) == 0.0 and time.monotonic() < until:
+            time.sleep(0.01)
+        for _ in range(200):
+            assert sleepers.longest(begun) >= longest > 0.0
+            time.sleep(0.001)
+        told = [line.split() for file in sleepers._folder.iterdir() for line in file.read_text().splitlines(True)[:-1]]
+        assert len({float(begun) for begun, _ in told}) > 10
+        assert sleepers.longest(time.monotonic() + 1.0) == 0.0
+    finally:
+        sleepers.stop()
+    assert not sleepers._folder.exists()
