@@ -38,10 +38,10 @@ scenarios: $(STAMP)  ## fly the longer scenarios in simulated time, build and in
 sitl: $(STAMP)  ## fly the real flight stacks that ARM_COMPANION_ARDUPILOT_SITL and ARM_COMPANION_PX4_SITL name
 	@test -n "$$ARM_COMPANION_ARDUPILOT_SITL$$ARM_COMPANION_PX4_SITL" || \
 		{ echo "name your own SITL program first: see tests/sitl/README.md" >&2; exit 2; }
-	@$(BIN)/python -m pytest -m sitl -s tests/sitl
+	@$(BIN)/python -m pytest --timeout 7200 -m sitl -s tests/sitl
 
 soak: $(STAMP)  ## an hour of hostile traffic, ten minutes of bus, 10,000 questions to the mechanics: none may go wrong
-	@$(BIN)/python -m pytest -m soak
+	@$(BIN)/python -m pytest --timeout 7200 -m soak
 	@$(BIN)/python -m tests.soak
 
 mutants: $(STAMP)  ## put small faults into the mission and see that the tests notice (long; or MUTANTS='tries vigil --number 50')

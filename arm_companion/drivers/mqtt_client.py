@@ -142,11 +142,25 @@ class Connection:
         )
 
     async def _session(self, client: aiomqtt.Client) -> None:
-        await self._publish(client, Packet("availability", ONLINE))
-        for packet in self._backlog.to_repeat():
+        try:
+            await self._greet(client)
+            await self._converse(client)
+        finally:
+            # where the broker still takes it: after a clean goodbye it does not make our will known
+            with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
+                async with asyncio.timeout(_FAREWELL_S):
+                    await self._publish(client, Packet("availability", OFFLINE))
+
+    async def _greet(self, client: aiomqtt.Client) -> None:
+        for packet in (Packet("availability", ONLINE), *self._backlog.to_repeat()):
+            _heed_cancel()
             await self._publish(client, packet)
         if self._config.commands:
             await client.subscribe(topic(self._config.vehicle, "command"), qos=1)
+        _heed_cancel()
+
+    async def _converse(self, client: aiomqtt.Client) -> None:
+        """Send and hear until one of the two fails, or we are cancelled."""
         sending = asyncio.create_task(self._send(client))
         hearing = asyncio.create_task(self._hear(client))
         try:
@@ -156,12 +170,7 @@ class Connection:
         finally:
             sending.cancel()
             hearing.cancel()
-            ends = await asyncio.gather(sending, hearing, return_exceptions=True)
-            if any(isinstance(end, asyncio.CancelledError) for end in ends):
-                # we end, or the other half failed: a goodbye, where the broker still takes it
-                with contextlib.suppress(aiomqtt.MqttError, TimeoutError):
-                    async with asyncio.timeout(_FAREWELL_S):
-                        await self._publish(client, Packet("availability", OFFLINE))
+            await asyncio.gather(sending, hearing, return_exceptions=True)
 
     async def _send(self, client: aiomqtt.Client) -> None:
         while True:
@@ -171,6 +180,7 @@ class Connection:
             except aiomqtt.MqttError:
                 self._backlog.give_back(packet)
                 raise
+            _heed_cancel()
 
     async def _publish(self, client: aiomqtt.Client, packet: Packet) -> None:
         whole = topic(self._config.vehicle, packet.topic)
@@ -192,6 +202,13 @@ class Connection:
             self._budget, self._budget_at = _COMMANDS_PER_S, now
         self._budget -= 1
         return self._budget >= 0
+
+
+def _heed_cancel() -> None:
+    """Raise a cancellation that was lost: until Python 3.12 `asyncio.wait_for` loses one that comes with the answer."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
 
 
 def _name(version: ProtocolVersion) -> str:

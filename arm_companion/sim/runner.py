@@ -254,7 +254,8 @@ async def _daemon_process(arguments: Sequence[str], log: Path) -> AsyncIterator[
             if process.returncode is None:
                 process.send_signal(signal.SIGTERM)
                 try:
-                    await asyncio.wait_for(process.wait(), _STOP_WITHIN_S)
+                    async with asyncio.timeout(_STOP_WITHIN_S):
+                        await process.wait()
                 except TimeoutError:
                     process.kill()
                     await process.wait()

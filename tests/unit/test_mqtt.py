@@ -5,9 +5,9 @@ import contextlib
 import dataclasses
 import json
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import pytest
 from hypothesis import given
@@ -18,6 +18,7 @@ from arm_companion.config import Config, load
 from arm_companion.config.schema import MqttConfig
 from arm_companion.drivers import mqtt_payloads as payloads
 from arm_companion.drivers.component import Component
+from arm_companion.drivers.mqtt_client import Backlog, Connection
 from arm_companion.drivers.mqtt_payloads import Health
 from arm_companion.drivers.mqtt_publisher import MqttPublisher
 from arm_companion.errors import ConfigError, ProtocolError
@@ -433,3 +434,77 @@ def test_notices_become_events() -> None:
         assert topic("7", "events") == "arm/7/events"
 
     at_a_desk(test)
+
+
+class _Library:
+    """aiomqtt on Python 3.11: each call ends in `wait_for`, which loses a cancellation that comes with the answer."""
+
+    def __init__(self, slow: str, *, loses: bool) -> None:
+        self.slow = slow  # the call whose answer is waited for
+        self.loses = loses  # the answer comes with the cancellation
+        self.asked = asyncio.Event()
+        self.published: list[tuple[str, bytes]] = []
+
+    async def _answer(self, call: str) -> None:
+        if call == self.slow:
+            self.slow = ""
+            self.asked.set()
+            try:
+                await asyncio.Event().wait()
+            except asyncio.CancelledError:
+                if not self.loses:
+                    raise
+
+    async def __aenter__(self) -> Self:
+        await self._answer("connect")
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        pass
+
+    async def publish(self, name: str, payload: bytes, **_: object) -> None:
+        self.published.append((name.rsplit("/", 1)[-1], payload))
+        await self._answer(name.rsplit("/", 1)[-1])
+
+    async def subscribe(self, *_: object, **__: object) -> None:
+        await self._answer("subscribe")
+
+    @property
+    async def messages(self) -> AsyncIterator[object]:
+        await asyncio.Event().wait()
+        yield None
+
+
+@pytest.mark.parametrize("slow", ["connect", "availability", "subscribe", "state"])
+def test_a_cancellation_that_the_library_loses_ends_the_connection_all_the_same(
+    slow: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def main() -> None:
+        library, backlog = _Library(slow, loses=True), Backlog(10)
+        backlog.put(Packet("state", b"1"))
+        connection = Connection(MqttConfig(host="localhost", vehicle="7", commands=True), backlog, print, print)
+        monkeypatch.setattr(connection, "_client", lambda _: library)
+        task = asyncio.create_task(connection.run())
+        await library.asked.wait()
+        task.cancel()
+        done, _ = await asyncio.wait({task}, timeout=5.0)
+        assert done, "it goes on"
+        assert task.cancelled()
+        assert library.published[-1] == ("availability", b"offline")
+
+    run_simulated(main())
+
+
+def test_one_who_is_cancelled_while_it_says_hello_says_goodbye(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        library = _Library("availability", loses=False)
+        connection = Connection(MqttConfig(host="localhost", vehicle="7"), Backlog(10), print, print)
+        monkeypatch.setattr(connection, "_client", lambda _: library)
+        task = asyncio.create_task(connection.run())
+        await library.asked.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        assert library.published == [("availability", b"online"), ("availability", b"offline")]
+
+    run_simulated(main())
