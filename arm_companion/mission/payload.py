@@ -6,9 +6,10 @@ of the tilt, and v the speed downwards,
 
     g - dv/dt = c (a + b (u - u_0)) + d v                                                     (free flight)
 
-has three unknowns: a, what the rotors lift while hovering, which drifts as the battery empties; b, how steep the
-curve of the rotors is, with whatever makes the supply sag; d, the drag. A Kalman filter finds them. Whatever
-the thrust then is beyond the weight of the vehicle m is load:
+has three unknowns: a, what the rotors lift while hovering, which falls as the battery empties; b, how steep the
+curve of the rotors is, with whatever makes the supply sag; d, the drag. A Kalman filter finds them, and how fast a
+falls, which goes on while something is held and a cannot be seen. Whatever the thrust then is beyond the weight of the
+vehicle m is load:
 
     (m + load) (g - dv/dt) = m (c (a + b (u - u_0)) + d v)                                    (carrying)
 
@@ -38,10 +39,11 @@ _MANOEUVRE = 0.3  # m/s^2, from which on steepness shows above the noise
 _FAST_M_PER_S = 0.5  # and drag
 _VIOLENT = 1.5  # m/s^2, beyond which the curve is no straight line
 _SPECTRUM = 1.5e-3  # m^2/s^3: an acceleration known to 0.05 m/s^2, with errors that last 0.3 s
-_DRIFT = 0.01  # m/s^2 per root second, of what the rotors lift at the same share
+_DRIFT = 0.005  # m/s^2 per root second, of what the rotors lift at the same share, besides the battery's fall
 _PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line through zero
 _PRIOR_DRAG = 0.14  # 1/s
-_PRIOR_SIGMA = (1.0, 0.35, 0.1)  # of a, m/s^2; of the slope, in the same terms; of the drag
+_PRIOR_SIGMA = (1.0, 0.35, 0.1, 0.003)  # of a, m/s^2; the slope, in the same terms; the drag; a's fall, m/s^3
+_FALL_DRIFT = 1e-4  # m/s^3 per root second
 _LEAST_SHARE = 0.05  # rotors that idle say nothing
 _CLIMB_M_PER_S = (
     0.15  # by which a take-off is known: PX4 says that it flies while its rotors still spin up on the ground
@@ -55,7 +57,8 @@ _MASS_SPREAD = 0.05  # one sigma of the vehicle's configured mass, relative
 _WEIGHED_S = 1.5  # of averaging, until a weight counts
 _ENOUGH_S = 8.0  # of averaging, from which on the weight is known, and drift is that of the battery
 
-Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+Vec4 = tuple[float, float, float, float]
+Covariance = tuple[Vec4, Vec4, Vec4, Vec4]
 
 
 @dataclass(frozen=True)
@@ -81,20 +84,20 @@ class ThrustCurve:
 
     Attributes:
         at: u_0, the share around which it is known.
-        theta: a (m/s^2), b (m/s^2) and d (1/s).
+        theta: a (m/s^2), b (m/s^2), d (1/s) and da/dt (m/s^3).
         covariance: of theta.
     """
 
     at: float
-    theta: tuple[float, float, float]
+    theta: Vec4
     covariance: Covariance
 
     @classmethod
     def prior(cls, at: float) -> "ThrustCurve":
         """What is known of a hover at the share `at` before anything was measured."""
         slope = GRAVITY / at
-        sigma = (_PRIOR_SIGMA[0], _PRIOR_SIGMA[1] * slope, _PRIOR_SIGMA[2])
-        theta = (GRAVITY, _PRIOR_SLOPE * slope, _PRIOR_DRAG)
+        sigma = (_PRIOR_SIGMA[0], _PRIOR_SIGMA[1] * slope, *_PRIOR_SIGMA[2:])
+        theta = (GRAVITY, _PRIOR_SLOPE * slope, _PRIOR_DRAG, 0.0)
         return cls(at, theta, _rows(np.diag(np.square(sigma))))
 
     @property
@@ -108,7 +111,7 @@ class ThrustCurve:
 
         Both flight stacks ask for the share u_h (1 + a / g) to accelerate by a, where u_h is that of their hover.
         """
-        a, b, _ = self.theta
+        a, b, _, _ = self.theta
         hover = self.at + (GRAVITY - a) / max(b, _LEAST_SLOPE)
         return min(max(b * hover / GRAVITY, _GAINS[0]), _GAINS[1])
 
@@ -123,26 +126,36 @@ class ThrustCurve:
 
     def learn(self, flow: Flow, felt: float, dt: float) -> "ThrustCurve":
         """The curve after `dt` seconds in which the rotors lifted the vehicle's mass by `felt` = g - dv/dt, m/s^2."""
+        ahead = self.ahead(dt)
         if abs(felt - GRAVITY) > _VIOLENT:
-            return self.forget(dt)
-        h, before, P = self._regressor(flow), np.array(self.theta), np.array(self.covariance)
-        P[0, 0] += _DRIFT**2 * dt
+            return ahead
+        h, before, P = self._regressor(flow), np.array(ahead.theta), np.array(ahead.covariance)
         Ph = P @ h
         spread = h @ Ph + _SPECTRUM / dt
         gain = Ph / spread
         if abs(felt - GRAVITY) < _MANOEUVRE and abs(flow.sink) < _FAST_M_PER_S:
-            gain[1:] = 0.0  # Schmidt's filter: what is not learnt stays as uncertain as it is
+            gain[1:3] = 0.0  # Schmidt's filter: what is not learnt stays as uncertain as it is
         theta = before + gain * (felt - float(h @ before))
         P += spread * np.outer(gain, gain) - np.outer(gain, Ph) - np.outer(Ph, gain)
-        return replace(self, theta=_three(theta), covariance=_rows(0.5 * (P + P.T)))
+        return replace(self, theta=_four(theta), covariance=_rows(0.5 * (P + P.T)))
 
     def _regressor(self, flow: Flow) -> Array:
-        return np.array((flow.up, flow.push - self.at * flow.up, flow.sink))
+        return np.array((flow.up, flow.push - self.at * flow.up, flow.sink, 0.0))
+
+    def ahead(self, dt: float) -> "ThrustCurve":
+        """The curve after `dt` seconds of flight in which nothing could be learnt, and the battery went on emptying."""
+        theta, P = np.array(self.theta), np.array(self.covariance)
+        theta[0] += theta[3] * dt
+        P[0] += P[3] * dt
+        P[:, 0] += P[:, 3] * dt
+        P[0, 0] += _DRIFT**2 * dt
+        P[3, 3] += _FALL_DRIFT**2 * dt
+        return replace(self, theta=_four(theta), covariance=_rows(P))
 
     def forget(self, dt: float) -> "ThrustCurve":
-        """The curve after `dt` seconds in which nothing could be learnt, and the battery went on emptying."""
+        """The curve after `dt` seconds with rotors that idle, or whose thrust is not told."""
         first, *rest = self.covariance
-        return replace(self, covariance=((first[0] + _DRIFT**2 * dt, first[1], first[2]), rest[0], rest[1]))
+        return replace(self, covariance=((first[0] + _DRIFT**2 * dt, *first[1:]), rest[0], rest[1], rest[2]))
 
 
 @dataclass(frozen=True)
@@ -240,7 +253,7 @@ def watch_load(
     if lifted is not None:
         curve = (curve or ThrustCurve.prior(flow.push / flow.up)).learn(flow, felt * (1.0 + lifted / mass), dt)
     elif curve is not None:
-        curve = curve.forget(dt)
+        curve = curve.ahead(dt)
     now = math.nan if curve is None else mass * (curve.lift(flow) / max(felt, 0.3 * GRAVITY) - 1.0)
     return replace(old, curve=curve, flow=flow, seen_s=seen_s, now=now)
 
@@ -271,10 +284,10 @@ def _filtered(old: Flow, new: Flow, dt: float, lag_s: float) -> Flow:
     )
 
 
-def _three(v: Array) -> tuple[float, float, float]:
-    x, y, z = v.tolist()
-    return x, y, z
+def _four(v: Array) -> Vec4:
+    a, b, d, fall = v.tolist()
+    return a, b, d, fall
 
 
 def _rows(P: Array) -> Covariance:
-    return _three(P[0]), _three(P[1]), _three(P[2])
+    return _four(P[0]), _four(P[1]), _four(P[2]), _four(P[3])

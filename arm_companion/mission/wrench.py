@@ -206,7 +206,7 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     except ModelError:
         return _nothing(source)
     if holding:
-        found = _weigh(found, s, solution)
+        found = _weigh(found, s)
     # how the bar pushes on an arm that touches but does not hold is not known
     report = _report(found, source, valid=source is not WrenchSource.CONTACT)
     return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
@@ -225,7 +225,7 @@ def _spread(s: Situation, solution: ArmSolution) -> Spread:
     return replace(_SPREAD, mass=math.hypot(_SPREAD.mass, sigma))
 
 
-def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
+def _weigh(found: Reaction, s: Situation) -> Reaction:
     """Model and motion, each axis by its variance: a millimetre is half a newton, but the vehicle feels a tenth.
 
     What the vehicle feels comes from the force observer, north and east. Down, where a wrap slides on its bar rather
@@ -237,7 +237,8 @@ def _weigh(found: Reaction, s: Situation, solution: ArmSolution) -> Reaction:
     model = R_wb @ found.wrench[:3]
     model_variance = R_wb**2 @ found.sigma[:3] ** 2 + np.square(_SLIDE_SIGMA)
     down, down_variance = _carried(s)
-    felt = np.array((*s.state.force.residual, solution.moments.mass * GRAVITY + down))
+    weight = s.parameters.model.parameters.mass * GRAVITY  # of the whole arm: the wrap's, too, was the rotors' before
+    felt = np.array((*s.state.force.residual, weight + down))
     felt_variance = np.array((*np.square(_FELT_SIGMA[:2]), down_variance))
     share = felt_variance / (felt_variance + model_variance)
     force = R_wb.T @ (share * model + (1.0 - share) * felt)

@@ -50,7 +50,7 @@ def carrying(phase: Phase, *, up: float = HEIGHT, now: float = MASS, **fields: o
 
 
 def _known() -> ThrustCurve:
-    small = ((1e-3, 0.0, 0.0), (0.0, 0.1, 0.0), (0.0, 0.0, 1e-3))
+    small = ((1e-3, 0.0, 0.0, 0.0), (0.0, 0.1, 0.0, 0.0), (0.0, 0.0, 1e-3, 0.0), (0.0, 0.0, 0.0, 1e-8))
     return dataclasses.replace(ThrustCurve.prior(HOVER), covariance=small)
 
 

@@ -221,7 +221,8 @@ def test_down_a_perched_vehicle_feels_what_its_rotors_lift_beyond_its_weight(
     parameters: Parameters, hovering: Hovering
 ) -> None:
     bend, mass, share = (4.9, 0.0), parameters.config.vehicle.mass_kg, 0.5
-    curve = ThrustCurve(share, (GRAVITY, GRAVITY / share, 0.1), ((1e-4, 0.0, 0.0), (0.0, 1e-2, 0.0), (0.0, 0.0, 1e-4)))
+    known = ((1e-4, 0.0, 0.0, 0.0), (0.0, 1e-2, 0.0, 0.0), (0.0, 0.0, 1e-4, 0.0), (0.0, 0.0, 0.0, 1e-8))
+    curve = ThrustCurve(share, (GRAVITY, GRAVITY / share, 0.1, 0.0), known)
     weighed = Load(curve=curve, flow=Flow(1.0, share, 0.0), seen_s=5.0)
     held = at(Phase.PERCHED, bend=bend, bend_goal=bend, position=(2.0, 0.0, -2.2), tension=(25.0, 9.0, 0.5, 9.0))
     anchor = grip(Situation(held, hovering(bend), 100.0, parameters))
@@ -235,6 +236,8 @@ def test_down_a_perched_vehicle_feels_what_its_rotors_lift_beyond_its_weight(
     unweighed, level, pulled = wrench(NO_LOAD, 2.0), wrench(weighed, 0.0), wrench(weighed, 2.0)
     assert pulled.force_b[2] - level.force_b[2] == pytest.approx(2.0, rel=0.03)
     assert unweighed.force_b[2] == pytest.approx(level.force_b[2], abs=0.1)
+    # rotors that lift the vehicle alone carry its arm, and that the wrap is around a bar changes nothing
+    assert level.force_b[2] == pytest.approx(parameters.model.parameters.mass * GRAVITY, abs=0.02)
     assert 0.05 < pulled.force_sigma[2] < 0.3
     assert unweighed.force_sigma[2] > 1.0
 

@@ -177,6 +177,22 @@ def test_an_emptying_battery_is_not_taken_for_a_load_however_long_it_is_carried(
     assert load.now < 0.5 * load.mass
 
 
+@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("sag", [0.0, 2e-4, 4e-4])
+def test_the_battery_goes_on_emptying_while_something_is_held_and_nothing_can_be_learnt(sag: float, seed: int) -> None:
+    rotors = Rotors(sag=sag, seed=seed)
+    load = climb_and_hover(rotors, seconds=35.0)
+    for _ in range(4000):
+        load = watch_load(load, rotors.step(0.0, 0.0), MASS, DT, lifted=None)
+    seen = []
+    for _ in range(500):
+        load = watch_load(load, rotors.step(0.0, 0.0), MASS, DT, lifted=None)
+        seen.append(load.now)
+    emptied = MASS * sag * 40.0  # which before stood for as much load
+    assert np.mean(seen) == pytest.approx(0.0, abs=max(0.01, 0.4 * emptied))
+    assert abs(np.mean(seen)) < 2.0 * load.sigma_now(MASS)
+
+
 @pytest.mark.parametrize("thrust", [math.nan, 0.0])
 def test_without_a_thrust_there_is_no_load_of_this_moment_and_the_weight_stays(thrust: float) -> None:
     rotors = Rotors()
