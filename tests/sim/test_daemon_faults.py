@@ -2,17 +2,18 @@
 
 import asyncio
 import random
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from arm_companion import app
 from arm_companion.clock import run_simulated
-from arm_companion.config import load
+from arm_companion.config import Config, load
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.state import Phase
 from arm_companion.sim.judges import SCENARIOS
-from arm_companion.sim.runner import fly_simulated
+from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.world import World
 from arm_companion.supervisor import ServiceManager
 
@@ -50,26 +51,44 @@ def test_an_exception_in_the_cycle_holds_the_arm_and_is_told(monkeypatch: pytest
     assert all(t.torque and t.ready for t in after.facts.tendons), "the arm held, and follows again"
 
 
+def stand_still(monkeypatch: pytest.MonkeyPatch, pause: Callable[[Phase, float], float]) -> list[float]:
+    """Make cycles late by what `pause` says of phase and time, s; returns the times at which it happened."""
+    real, at = app.Daemon._observe, []
+
+    async def late(daemon: app.Daemon) -> Facts:
+        now = asyncio.get_running_loop().time()
+        if seconds := pause(daemon._state.phase, now):
+            at.append(now)
+            await asyncio.sleep(seconds)
+        return await real(daemon)
+
+    monkeypatch.setattr(app.Daemon, "_observe", late)
+    return at
+
+
+def assert_within_limits(result: Result, config: Config) -> None:
+    tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
+    assert tension <= config.limits.tension_max_n
+
+
 @pytest.mark.scenario
 def test_cycles_that_come_late_again_and_again_overstress_no_tendon_around_a_bar(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = load("sim.toml")
-    real, stalls = app.Daemon._observe, [0.0]
+    config, due = load("sim.toml"), 0.0
 
-    async def late(daemon: app.Daemon) -> Facts:
-        now = asyncio.get_running_loop().time()
-        if daemon._state.phase in {Phase.CONTACT, Phase.WRAP, Phase.VERIFY} and now - stalls[-1] > 0.45:
-            stalls.append(now)
-            await asyncio.sleep(0.2)
-        return await real(daemon)
+    def pause(phase: Phase, now: float) -> float:
+        nonlocal due
+        if phase not in {Phase.CONTACT, Phase.WRAP, Phase.VERIFY} or now < due:
+            return 0.0
+        due = now + 0.45
+        return 0.2
 
-    monkeypatch.setattr(app.Daemon, "_observe", late)
+    stalls = stand_still(monkeypatch, pause)
     result = run_simulated(fly_simulated(config, lambda _: None))
     assert len(stalls) > 20
     assert result.failure == ""
-    tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
-    assert tension <= config.limits.tension_max_n
+    assert_within_limits(result, config)
 
 
 @pytest.mark.scenario
@@ -77,21 +96,19 @@ def test_cycles_that_come_late_again_and_again_overstress_no_tendon_around_a_bar
 def test_a_computer_that_stands_still_every_other_second_hangs_and_grasps_all_the_same(
     monkeypatch: pytest.MonkeyPatch, scenario: str, name: str
 ) -> None:
-    config = load(name)
-    real, chance, stalls = app.Daemon._observe, random.Random(1), [0.0]
+    config, chance, due = load(name), random.Random(1), 0.0
 
-    async def late(daemon: app.Daemon) -> Facts:
-        now = asyncio.get_running_loop().time()
-        if now > stalls[-1] and daemon._state.phase is not Phase.STARTUP:
-            stalls.append(now + chance.uniform(1.0, 3.0))
-            await asyncio.sleep(chance.uniform(0.15, 0.3))
-        return await real(daemon)
+    def pause(phase: Phase, now: float) -> float:
+        nonlocal due
+        if phase is Phase.STARTUP or now < due:
+            return 0.0
+        due = now + chance.uniform(1.0, 3.0)
+        return chance.uniform(0.15, 0.3)
 
-    monkeypatch.setattr(app.Daemon, "_observe", late)
+    stalls = stand_still(monkeypatch, pause)
     plan = SCENARIOS[scenario]
     result = run_simulated(fly_simulated(config, lambda _: None, fly=plan.fly))
     assert len(stalls) > 40
     verdict = plan.judge(result.flight, result.failure, config)
     assert verdict.success, verdict.verdict
-    tension = max(tendon.tension for record in result.records for tendon in record.facts.tendons)
-    assert tension <= config.limits.tension_max_n
+    assert_within_limits(result, config)
