@@ -13,8 +13,9 @@ asked for: e = s w and
     (1 + D) w''' + (P + D K) w'' + (I + P K) w' + I K w = u.
 
 Position, velocity and acceleration of e belong to each other, so that the path is followed and not bent. It fades by
-itself as ArduPilot's integrator takes the force over. Down, where an inner loop follows the measured acceleration (P_a
-and I_a, here in m/s^2 of thrust for a m/s^2 of error), P_a s + I_a stands in the place of s:
+itself as ArduPilot's integrator takes the force over: w is what that integrator holds by then. A set-point that comes
+late must not forget it, or the same force is handed over twice. Down, where an inner loop follows the measured
+acceleration (P_a and I_a, here in m/s^2 of thrust for a m/s^2 of error), P_a s + I_a stands in the place of s:
 
     (P_a s + I_a) (s^2 + P s + P K) w = u.
 """
@@ -31,6 +32,7 @@ _LEVEL: Final = (1.0 + _D, _P + _D * _K, _I + _P * _K, _I * _K)
 _P_DOWN, _K_DOWN, _P_A, _I_A = 5.0, 1.0, 0.98, 1.96
 _DOWN: Final = (_P_A, _P_A * _P_DOWN + _I_A, _P_A * _P_DOWN * _K_DOWN + _I_A * _P_DOWN, _I_A * _P_DOWN * _K_DOWN)
 _LONGEST_STEP_S: Final = 0.1
+_FLIES_ON_S: Final = 3.0  # GUID_TIMEOUT: so long a path goes on whose set-points stop
 _NOTHING: Final = 1e-6
 
 
@@ -49,6 +51,15 @@ class _Axis:
         self.speed += dt * self.acceleration  # the newest speed moves the place: stable where the oldest is not
         self.place += dt * self.speed
         self.w += dt * self.place
+
+    def fly_on(self, dt: float) -> None:
+        """What the autopilot makes of a gap in the set-points: the last acceleration goes on, and then it stops."""
+        if dt > _FLIES_ON_S:
+            self.place = self.speed = self.acceleration = 0.0
+            return
+        self.w += dt * (self.place + dt * (self.speed / 2.0 + dt * self.acceleration / 6.0))
+        self.place += dt * (self.speed + dt * self.acceleration / 2.0)
+        self.speed += dt * self.acceleration
 
 
 class PathFeedforward:
@@ -69,11 +80,13 @@ class PathFeedforward:
         Args:
             setpoint: its acceleration is what the thrust shall make beyond that of hovering, m/s^2; what of it belongs
                 to position and velocity is a path already.
-            now: loop time, s; set-points that come later than 0.1 s after the last begin anew.
+            now: loop time, s.
         """
-        if self._last is not None and now - self._last > _LONGEST_STEP_S:
-            self.reset()
         dt = 0.0 if self._last is None else now - self._last
+        if dt > _LONGEST_STEP_S:
+            for axis in self._axes:
+                axis.fly_on(dt)
+            dt = 0.0
         self._last = now
         # of a path that is flown anyway, the acceleration is what ArduPilot takes it for
         forces = [a - b for a, b in zip(setpoint.acceleration_w, setpoint.path_w, strict=True)]
