@@ -9,6 +9,7 @@ import contextlib
 import errno
 import logging
 import os
+import termios
 from collections import deque
 from pathlib import Path
 
@@ -26,6 +27,8 @@ LONGEST_LATENCY_TIMER_MS = 4
 """An adapter whose latency timer is longer spoils a servo bus; FTDI ships 16 ms."""
 
 _READ_SIZE = 4096
+_FAILURES = (OSError, termios.error)
+"""What pyserial raises of a device: its SerialException is an OSError, what it passes on from termios is none."""
 
 
 class SerialPort:
@@ -134,17 +137,25 @@ def open_serial(port: str, baud: int) -> Opener:
     async def open_port(receiver: Receiver) -> SerialPort:
         try:
             device = serial.Serial(port, baudrate=baud, timeout=0, write_timeout=0, exclusive=True)
-        except (OSError, ValueError) as error:  # serial.SerialException is an OSError
-            reason: object = error
-            if isinstance(error, OSError) and error.errno in {errno.EAGAIN, errno.EBUSY}:
-                reason = "another program holds its lock (the daemon, or another command on the servo bus)"
-            elif isinstance(error, OSError) and error.errno:
-                reason = os.strerror(error.errno)
-            raise LinkError(f"cannot open {port} at {baud} bit/s: {reason}") from error
-        _prefer_latency(device)
+        except (*_FAILURES, ValueError) as error:
+            raise LinkError(f"cannot open {port} at {baud} bit/s: {_reason(error)}") from error
+        try:
+            _prefer_latency(device)
+            device.reset_input_buffer()
+        except _FAILURES as error:
+            with contextlib.suppress(OSError):
+                device.close()
+            raise LinkError(f"{port} was lost while it was opened: {_reason(error)}") from error
         return SerialPort(device, receiver)
 
     return open_port
+
+
+def _reason(error: Exception) -> object:
+    code = error.args[0] if isinstance(error, termios.error) else getattr(error, "errno", None)
+    if code in {errno.EAGAIN, errno.EBUSY}:
+        return "another program holds its lock (the daemon, or another command on the servo bus)"
+    return os.strerror(code) if code else error
 
 
 def latency_timer_ms(port: str, sysfs: Path = Path("/sys")) -> int | None:
@@ -175,7 +186,5 @@ def latency_advice(port: str, sysfs: Path = Path("/sys")) -> str:
 def _prefer_latency(device: serial.Serial) -> None:
     with contextlib.suppress(OSError, ValueError, NotImplementedError):  # a pty and most UARTs know no such mode
         device.set_low_latency_mode(True)
-    with contextlib.suppress(OSError, serial.SerialException):
-        device.reset_input_buffer()
     if advice := latency_advice(str(device.port)):
         _log.warning("%s", advice)
