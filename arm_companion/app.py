@@ -258,7 +258,7 @@ class Daemon:
         every = await self._bus.read()
         servos = every[: len(self._config.servos.ids)]  # the tendons'; a gripper's may be behind them
         now = self._clock.now()
-        if any(servo.tripped for servo in every) and now >= self._rearm_at:
+        if now >= self._rearm_at and self._bus.connected and any(s.tripped and not s.silent for s in every):
             self._rearm_at = now + _REARM_EVERY_S
             await self._rearm()
         ready = tuple(servo.ready for servo in servos)
@@ -293,7 +293,7 @@ class Daemon:
         self._component.notify(Notice(Severity.WARNING, text))
         self._tendons.rest()
         try:
-            await self._bus.start()
+            await self._bus.rearm()
         except* DeviceFault as faults:
             log.error("re-arming: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
 

@@ -8,9 +8,8 @@ import dataclasses
 from collections.abc import Sequence
 
 from arm_companion.config.schema import Config, GripperConfig, ServosConfig
-from arm_companion.drivers.servo_bus import settings_of
 from arm_companion.drivers.servo_health import ServoState
-from arm_companion.drivers.servo_setup import Settings
+from arm_companion.drivers.servo_setup import Settings, settings_of
 from arm_companion.mission.gripper_facts import GripperAction, GripperOrder, GripperState, JawState
 from arm_companion.protocol import control_table as ct
 

@@ -11,11 +11,11 @@ import random
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
 from arm_companion.config.schema import ServosConfig
-from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState
+from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState, fault_of, raise_together
 from arm_companion.drivers.servo_homing import adopt, doubt, home
 from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.drivers.servo_reader import ServoReader
-from arm_companion.drivers.servo_setup import ServoInfo, Settings, set_up
+from arm_companion.drivers.servo_setup import SPEED_LIMIT_RAD_PER_S, ServoInfo, Settings, set_up, settings_of
 from arm_companion.errors import DeviceFault, LinkError
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
@@ -23,23 +23,12 @@ from arm_companion.transport.base import Opener, Transport
 
 _log = logging.getLogger(__name__)
 
-SPEED_LIMIT_RAD_PER_S = 6.0
-"""Of the servos' own trajectories, just under what an XL430 does at 12 V."""
-
 _CHECK_S = 0.25  # between attempts to set up a servo that is not
 _TORQUE_RETRY_S = 0.2
 _BOOT_TRIES = 6
 _TRIES = 4
 _RECONNECT_FIRST_S = 0.05
 _RECONNECT_LONGEST_S = 2.0
-
-
-def settings_of(config: ServosConfig, speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S) -> Settings:
-    """What every servo of a configuration is set to."""
-    return Settings(
-        watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
-        profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
-    )
 
 
 class ServoBus:
@@ -90,7 +79,7 @@ class ServoBus:
     # Life of the link.
 
     async def start(self) -> None:
-        """Open the port if need be and prepare every servo for goals; also what clears a watchdog trip.
+        """Open the port if need be and prepare every servo for goals; also clears watchdog trips.
 
         Torque stays as it is. All servos are tried whatever happens to one.
 
@@ -101,11 +90,23 @@ class ServoBus:
         await self._connect()
         await self._for_each("start", self._records, self._set_up)
 
+    async def rearm(self) -> None:
+        """Clear the watchdog trips of those servos that answer.
+
+        For the cycle, which must not wait: neither opens the port nor asks a servo that is silent.
+
+        Raises:
+            ExceptionGroup: of one `DeviceFault` for each servo that could not be armed again.
+        """
+        if self.connected:
+            armable = [r for r in self._records if r.tripped and r.missed < self._config.silent_after]
+            await self._for_each("re-arm", armable, self._set_up)
+
     async def run(self) -> None:
         """Keep the port open and new servos set up, until cancelled.
 
         A servo that lost its power is set up again, and stays marked as having lost its turns. A watchdog
-        trip in a servo that was set up before stays until `start`.
+        trip in a servo that was set up before stays until `rearm` or `start`.
         """
         delay = _RECONNECT_FIRST_S
         while True:
@@ -150,7 +151,7 @@ class ServoBus:
                 await action(record)
             except DeviceFault as fault:
                 faults.append(fault)
-        _raise(what, faults)
+        raise_together(what, faults)
 
     async def _connect(self) -> Transport:
         async with self._opening:
@@ -158,6 +159,11 @@ class ServoBus:
                 self._transport = await self._opener(self._link.receive)
                 self._link.attach(self._transport)
             return self._transport
+
+    @property
+    def connected(self) -> bool:
+        """The port is open."""
+        return self._link.connected
 
     def _disconnect(self) -> None:
         self._transport = None
@@ -271,7 +277,7 @@ class ServoBus:
         for _ in range(_TRIES):
             await self._reader.read()
             await self._switch_on([r for r in self._records if not r.torque])
-        _raise("torque on", [_fault(r, "its torque does not come on") for r in self._records if not r.torque])
+        raise_together("torque on", [fault_of(r, "its torque does not come on") for r in self._records if not r.torque])
 
     async def limp(self) -> None:
         """Let every servo go: one frame to all of them at once, then each one until it confirms.
@@ -379,14 +385,3 @@ class ServoBus:
     def counters(self) -> BusCounters:
         """History of the bus, for telemetry."""
         return BusCounters.of(self._link, self._records, self.reconnects)
-
-
-def _fault(record: ServoRecord, otherwise: str) -> DeviceFault:
-    if record.missed:
-        return DeviceFault(record.id, 0, "does not answer")
-    return DeviceFault(record.id, record.error_bits, "" if record.error_bits else otherwise)
-
-
-def _raise(what: str, faults: Sequence[DeviceFault]) -> None:
-    if faults:
-        raise ExceptionGroup(f"{what}: {len(faults)} of the servos failed", faults)

@@ -1,7 +1,7 @@
 """What is known of one servo: its last answer, its faults, and the history that telemetry shows."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -211,3 +211,16 @@ class BusCounters:
             reconnects=reconnects,
             latency_s=link.latency.mean_s,
         )
+
+
+def fault_of(record: ServoRecord, otherwise: str) -> DeviceFault:
+    """What a servo has that did not do as it was told: what is known to be wrong with it, or else `otherwise`."""
+    if record.missed:
+        return DeviceFault(record.id, 0, "does not answer")
+    return DeviceFault(record.id, record.error_bits, "" if record.error_bits else otherwise)
+
+
+def raise_together(what: str, faults: Sequence[DeviceFault]) -> None:
+    """Raise an `ExceptionGroup` if there are any faults."""
+    if faults:
+        raise ExceptionGroup(f"{what}: {len(faults)} of the servos failed", faults)

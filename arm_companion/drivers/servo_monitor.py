@@ -3,11 +3,11 @@
 import asyncio
 
 from arm_companion.config.schema import ServosConfig
-from arm_companion.drivers.servo_bus import settings_of
 from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState
 from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.drivers.servo_reader import ServoReader
 from arm_companion.drivers.servo_scan import ping
+from arm_companion.drivers.servo_setup import settings_of
 from arm_companion.transport.base import Opener, Transport
 
 

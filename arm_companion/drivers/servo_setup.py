@@ -3,12 +3,16 @@
 import asyncio
 from dataclasses import dataclass
 
+from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import ServoRecord
 from arm_companion.drivers.servo_link import DRAIN_S, ServoLink
 from arm_companion.errors import DeviceFault
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
 from arm_companion.protocol.control_table import OperatingMode
+
+SPEED_LIMIT_RAD_PER_S = 6.0
+"""Of the servos' own trajectories, just under what an XL430 does at 12 V."""
 
 _PING_SIZE = 3
 
@@ -30,6 +34,14 @@ class Settings:
     profile_acceleration: int = 0
     goal_pwm: int | None = None
     within_a_turn: bool = False
+
+
+def settings_of(config: ServosConfig, speed_limit_rad_per_s: float = SPEED_LIMIT_RAD_PER_S) -> Settings:
+    """What every servo of a configuration is set to."""
+    return Settings(
+        watchdog=min(max(round(config.watchdog_s / ct.WATCHDOG_UNIT_S), 1), ct.BUS_WATCHDOG.upper),
+        profile_velocity=max(round(speed_limit_rad_per_s / ct.VELOCITY_UNIT_RAD_PER_S), 1),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -139,3 +139,18 @@ def test_the_feedforward_is_switched_over_mavlink(tmp_path: Path) -> None:
                 assert daemon._state.feedforward is on
 
     run_simulated(main())
+
+
+def test_servos_that_tripped_and_fell_silent_cost_the_cycle_nothing(tmp_path: Path) -> None:
+    async def main() -> None:
+        async with running(config(tmp_path)) as (daemon, _, ground, _recorder, _task):
+            ground.send(GCS)
+            for record in daemon._bus._records:
+                record.tripped = True
+            cycles = daemon.cycles
+            await asyncio.sleep(3.0)
+            assert daemon.cycles == pytest.approx(cycles + 300, abs=2)
+            assert (daemon.missed, daemon.failures) == (0, 0)
+            assert "silent too long" not in "".join(text.text for text in ground.all("STATUSTEXT"))
+
+    run_simulated(main())

@@ -17,13 +17,14 @@ from arm_companion.clock import run_simulated
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_health import ServoState
-from arm_companion.errors import DeviceFault
+from arm_companion.errors import DeviceFault, LinkError
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError
 from arm_companion.sim import servo_faults
 from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.sim.servo_faults import ByteDelay
+from arm_companion.transport.base import Receiver, Transport
 from arm_companion.transport.memory import MemoryPipe
 
 CONFIG = ServosConfig()
@@ -270,6 +271,36 @@ def test_cable_out_and_in_again_goes_on_where_it_was() -> None:
         await arm.run(1.0, HOME + 100)
         assert arm.faults() == {}
         assert arm.at(HOME + 100, ALL)
+
+    story(play)
+
+
+def test_re_arming_neither_opens_the_port_nor_waits_for_a_silent_servo() -> None:
+    async def play(arm: Arm) -> None:
+        await asyncio.sleep(0.5)  # the daemon is stopped, and the watchdogs trip
+        await arm.run(1.0, HOME, until=lambda: all(state.tripped for state in arm.states))
+        arm.emulator[2].silenced = True
+        await arm.run(1.0, HOME, until=lambda: arm.states[1].silent)
+        await arm.bus.rearm()
+        await arm.run(0.05, HOME)
+        assert [state.tripped for state in arm.states] == [False, True, False, False]
+        loop, opened = asyncio.get_running_loop(), []
+
+        async def dead(_: Receiver) -> Transport:
+            opened.append(loop.time())
+            await asyncio.sleep(3.0)  # a bridge that does not answer
+            raise LinkError("no answer")
+
+        arm.bus._opener = dead
+        arm.unplug()
+        before = loop.time()
+        await arm.bus.rearm()
+        assert loop.time() == before
+        await arm.run(0.5)
+        before, n = loop.time(), len(opened)
+        await arm.bus.rearm()
+        assert (loop.time(), len(opened)) == (before, n)
+        assert not arm.bus.connected
 
     story(play)
 
