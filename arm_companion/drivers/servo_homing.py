@@ -36,6 +36,7 @@ async def adopt(link: ServoLink, record: ServoRecord, zero: int, window: int) ->
     """
     if await link.read(record.id, ct.LED):
         record.turns_lost = False
+        record.vouched = True  # whoever lit it: a jump must put it out
         return
     if record.torque:
         await _believe(link, record)

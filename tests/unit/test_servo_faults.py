@@ -372,6 +372,27 @@ def test_beside_a_servo_that_holds_nothing_is_taken_for_granted() -> None:
         assert [state.turns_lost for state in states] == [True, True, True, False]
 
 
+def test_a_jump_seen_by_a_daemon_that_was_restarted_is_known_to_the_next_one() -> None:
+    async def main() -> None:
+        arm = Arm(CONFIG)
+        arm.plug_in()
+        passing = asyncio.create_task(keep_time(arm.emulator))
+        await arm.wire.wait_ready()
+        for life, jump in enumerate((0.0, 3000.0, 0.0)):
+            arm.bus = ServoBus(arm.pipe.opener(1), CONFIG)
+            running = asyncio.create_task(arm.bus.run())
+            await arm.run(0.5)
+            assert [state.turns_lost for state in arm.states] == [life == 2, False, False, False]
+            arm.emulator[1].motor.position += jump
+            await arm.run(0.6)
+            assert [servo.peek(ct.LED) for servo in arm.emulator.servos] == [int(life == 0), 1, 1, 1]
+            running.cancel()
+            await arm.bus.stop(limp=False)
+        passing.cancel()
+
+    run_simulated(main())
+
+
 def test_homing_needs_the_torque_off() -> None:
     async def play(arm: Arm) -> None:
         with pytest.raises(DeviceFault, match="torque is on"):
