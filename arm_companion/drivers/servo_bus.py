@@ -29,6 +29,7 @@ _BOOT_TRIES = 6
 _TRIES = 4
 _RECONNECT_FIRST_S = 0.05
 _RECONNECT_LONGEST_S = 2.0
+_STEADY_S = 1.0  # a port that is lost sooner counts as one that does not open: a bridge may accept and hang up
 
 
 class ServoBus:
@@ -108,23 +109,27 @@ class ServoBus:
         A servo that lost its power is set up again, and stays marked as having lost its turns. A watchdog
         trip in a servo that was set up before stays until `rearm` or `start`.
         """
+        loop = asyncio.get_running_loop()
         delay = _RECONNECT_FIRST_S
         while True:
             try:
                 transport = await self._connect()
             except LinkError as error:
                 self._report(-1, str(error))
-                await asyncio.sleep(delay * (0.5 + 0.5 * self._rng.random()))
-                delay = min(2 * delay, _RECONNECT_LONGEST_S)
-                continue
-            self._report(-1, "")
-            delay = _RECONNECT_FIRST_S
-            async with asyncio.TaskGroup() as group:
-                setting_up = group.create_task(self._keep_set_up())
-                await transport.wait_closed()
-                setting_up.cancel()
-            self._disconnect()
-            self.reconnects += 1
+            else:
+                self._report(-1, "")
+                opened_at = loop.time()
+                async with asyncio.TaskGroup() as group:
+                    setting_up = group.create_task(self._keep_set_up())
+                    await transport.wait_closed()
+                    setting_up.cancel()
+                self._disconnect()
+                self.reconnects += 1
+                if loop.time() - opened_at >= _STEADY_S:
+                    delay = _RECONNECT_FIRST_S
+                    continue  # at once: the servos' watchdogs are running
+            await asyncio.sleep(delay * (0.5 + 0.5 * self._rng.random()))
+            delay = min(2 * delay, _RECONNECT_LONGEST_S)
 
     async def stop(self, *, limp: bool) -> None:
         """Release the port, with the torque off if `limp`; otherwise servos keep holding what they hold.

@@ -634,6 +634,40 @@ def test_run_waits_for_a_port_that_is_not_there_yet_with_growing_delays() -> Non
     assert len({round(gap, 6) for gap in gaps[-5:]}) == 5  # jittered
 
 
+@pytest.mark.parametrize(("stays_s", "fewest", "most"), [(0.0, 10, 30), (1.5, 19, 21)], ids=["at once", "later"])
+def test_a_port_that_opens_and_is_lost_is_opened_again_with_growing_delays_unless_it_stayed_for_a_while(
+    stays_s: float, fewest: int, most: int
+) -> None:
+    class Bridge:
+        """Accepts, and hangs up after a while."""
+
+        dropped = 0
+
+        def write(self, data: bytes) -> None:
+            """Nobody hears it."""
+
+        def close(self) -> None:
+            """It is."""
+
+        async def wait_closed(self) -> None:
+            await asyncio.sleep(stays_s)
+
+    async def main() -> int:
+        async def accept(_: Receiver) -> Transport:
+            assert bus.reconnects <= most, "it hardly pauses"
+            return Bridge()
+
+        bus = ServoBus(accept, CONFIG, rng=random.Random(0))
+        running = asyncio.create_task(bus.run())
+        done, _ = await asyncio.wait({running}, timeout=30.0)
+        for task in done:
+            task.result()
+        running.cancel()
+        return bus.reconnects
+
+    assert fewest <= run_simulated(main()) <= most
+
+
 def test_run_sets_up_a_servo_that_comes_late() -> None:
     def prepare(rig: Rig) -> None:
         rig.emulator[4].silenced = True
