@@ -114,6 +114,7 @@ class Connection:
                     await self._session(client)
             except (aiomqtt.MqttError, OSError, ValueError) as error:  # ValueError: ssl and paho on bad input
                 self._complain(error)
+            _heed_cancel()
             turn += not connected  # a broker that does not know MQTT 5 may know 3.1.1
             await asyncio.sleep(delay * (0.5 + 0.5 * self._jitter()))
             delay = min(2.0 * delay, self._config.reconnect_max_s)
@@ -205,7 +206,7 @@ class Connection:
 
 
 def _heed_cancel() -> None:
-    """Raise a cancellation that was lost: until Python 3.12 `asyncio.wait_for` loses one that comes with the answer."""
+    """Raise a cancellation that was lost: until Python 3.12 `asyncio.wait_for` loses one that comes with an outcome."""
     task = asyncio.current_task()
     if task is not None and task.cancelling():
         raise asyncio.CancelledError

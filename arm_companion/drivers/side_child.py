@@ -11,6 +11,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 _LINE_LIMIT: Final = 1 << 20
+_END_WITHIN_S: Final = 5.0
 
 Take = Callable[[str, str], None]
 """Takes topic and payload of one message."""
@@ -53,6 +54,10 @@ async def _main(body: Body) -> None:
     tasks = (asyncio.ensure_future(working), asyncio.create_task(read()))
     asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, tasks[0].cancel)
     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+    # The kernel's own alarm: a task may not heed its end, and the interpreter waits for every thread, such as one that
+    # looks a name up. A daemon that was killed cannot kill us.
+    signal.signal(signal.SIGALRM, signal.SIG_DFL)
+    signal.setitimer(signal.ITIMER_REAL, _END_WITHIN_S)
     for task in tasks:
         task.cancel()
         with contextlib.suppress(asyncio.CancelledError):

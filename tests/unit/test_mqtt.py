@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any, Self
 
+import aiomqtt
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -437,15 +438,19 @@ def test_notices_become_events() -> None:
 
 
 class _Library:
-    """aiomqtt on Python 3.11: each call ends in `wait_for`, which loses a cancellation that comes with the answer."""
+    """aiomqtt on Python 3.11: each call ends in `wait_for`, which loses a cancellation that comes with the outcome."""
 
-    def __init__(self, slow: str, *, loses: bool) -> None:
+    def __init__(self, slow: str, *, loses: bool, fails: bool = False) -> None:
         self.slow = slow  # the call whose answer is waited for
         self.loses = loses  # the answer comes with the cancellation
+        self.fails = fails  # and is that it failed, as does all that follows
+        self.gone = False
         self.asked = asyncio.Event()
         self.published: list[tuple[str, bytes]] = []
 
     async def _answer(self, call: str) -> None:
+        if self.gone:
+            raise aiomqtt.MqttError("connection refused")
         if call == self.slow:
             self.slow = ""
             self.asked.set()
@@ -454,6 +459,9 @@ class _Library:
             except asyncio.CancelledError:
                 if not self.loses:
                     raise
+                if self.fails:
+                    self.gone = True
+                    raise aiomqtt.MqttError("connection refused") from None
 
     async def __aenter__(self) -> Self:
         await self._answer("connect")
@@ -475,12 +483,13 @@ class _Library:
         yield None
 
 
+@pytest.mark.parametrize("fails", [False, True], ids=["answers", "fails"])
 @pytest.mark.parametrize("slow", ["connect", "availability", "subscribe", "state"])
 def test_a_cancellation_that_the_library_loses_ends_the_connection_all_the_same(
-    slow: str, monkeypatch: pytest.MonkeyPatch
+    slow: str, fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def main() -> None:
-        library, backlog = _Library(slow, loses=True), Backlog(10)
+        library, backlog = _Library(slow, loses=True, fails=fails), Backlog(10)
         backlog.put(Packet("state", b"1"))
         connection = Connection(MqttConfig(host="localhost", vehicle="7", commands=True), backlog, print, print)
         monkeypatch.setattr(connection, "_client", lambda _: library)
@@ -490,7 +499,8 @@ def test_a_cancellation_that_the_library_loses_ends_the_connection_all_the_same(
         done, _ = await asyncio.wait({task}, timeout=5.0)
         assert done, "it goes on"
         assert task.cancelled()
-        assert library.published[-1] == ("availability", b"offline")
+        if not (fails and slow == "connect"):  # then it never was there
+            assert library.published[-1] == ("availability", b"offline")
 
     run_simulated(main())
 
