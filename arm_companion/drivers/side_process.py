@@ -53,6 +53,8 @@ class SideProcess:
     ) -> None:
         self.dropped = 0
         """Entries that were dropped from the queue."""
+        self.malformed = 0
+        """Lines of the process that were no messages."""
         self._name = name
         self._module = module
         self._settings = settings
@@ -132,11 +134,24 @@ class SideProcess:
 
     async def _listen(self, pipe: asyncio.StreamReader) -> None:
         while line := await pipe.readline():
-            kind, text = json.loads(line)
-            if kind == "log":
-                log.info("%s: %s", self._name, text)
-            else:
-                self._hear(str(kind), str(text))
+            match _read(line):
+                case None:
+                    self.malformed += 1
+                    if self.malformed == 1:
+                        log.warning("%s: its process says what is no message: %.80r", self._name, line)
+                case ["log", text]:
+                    log.info("%s: %s", self._name, text)
+                case [kind, text]:
+                    self._hear(kind, text)
+
+
+def _read(line: bytes) -> list[str] | None:
+    """Kind and text of a line; None: it is none of ours, such as what a library prints."""
+    try:
+        said = json.loads(line)
+    except (ValueError, RecursionError):
+        return None
+    return said if isinstance(said, list) and len(said) == 2 and all(isinstance(word, str) for word in said) else None
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
