@@ -5,13 +5,14 @@ import json
 import logging
 import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypeVar
 
 from arm_companion.drivers.calibration import VERSION, TendonCalibration, TensionCalibration
 from arm_companion.drivers.servo_health import ServoState
+from arm_companion.drivers.writer import Writer
 from arm_companion.record_codec import dumps, loads
 
 _log = logging.getLogger(__name__)
@@ -115,7 +116,7 @@ class ParkingLog:
         self._known = dict(known)
         self._next_at = 0.0
         self._failed = False
-        self._writer = ThreadPoolExecutor(1, thread_name_prefix="parking log") if directory else None
+        self._writer = Writer("parking log") if directory else None
         self._writing: Future[None] | None = None
 
     def note(self, servos: Sequence[ServoState]) -> None:
@@ -130,11 +131,11 @@ class ParkingLog:
             self._writing = self._writer.submit(self._save)
 
     def close(self, servos: Sequence[ServoState] = ()) -> None:
-        """Write where the servos stand at the end."""
+        """Write where the servos stand at the end, unless the disk hangs."""
         if self._writer is not None:
             self._take(servos)
             self._writer.submit(self._save)
-            self._writer.shutdown()
+            self._writer.close()
             self._writer = None
 
     def _take(self, servos: Sequence[ServoState]) -> bool:

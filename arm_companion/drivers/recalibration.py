@@ -3,7 +3,7 @@
 import dataclasses
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from pathlib import Path
 
 from arm_companion.config.schema import Config, LimitsConfig
@@ -13,6 +13,7 @@ from arm_companion.drivers.calibration import TendonCalibration, identity, made_
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.tendons import Tendons
+from arm_companion.drivers.writer import Writer
 from arm_companion.errors import DeviceFault
 from arm_companion.mission.facts import Order, Request, Workshop
 from arm_companion.mission.state import CALIBRATES, Phase
@@ -42,7 +43,7 @@ class Recalibration:
         self._servos: Sequence[ServoState] = ()
         self._winding: Tendons | None = None
         self._shift: tuple[float, ...] = ()  # m, pull of each tendon where the winding began
-        self._writer: ThreadPoolExecutor | None = None
+        self._writer: Writer | None = None
         self._writing: Future[None] | None = None
         self._made: TendonCalibration | None = None
         self._kept: str | None = None
@@ -103,7 +104,7 @@ class Recalibration:
         ]
         known = tuple(identity(self._bus.info[servo]) for servo in servos.ids)
         self._made, self._kept = made_of(there, known, self._config, unix_s), None
-        self._writer = self._writer or ThreadPoolExecutor(1, thread_name_prefix="calibration")
+        self._writer = self._writer or Writer("calibration")
         self._writing = self._writer.submit(files.save, self._file, self._made)
 
     async def let_go(self) -> None:
@@ -114,9 +115,9 @@ class Recalibration:
             _log.debug("torque off: %s", faults.exceptions)
 
     def close(self) -> None:
-        """Wait for what is being written."""
+        """Wait for what is being written, but not for a disk that hangs."""
         if self._writer is not None:
-            self._writer.shutdown()
+            self._writer.close()
 
     @property
     def _file(self) -> Path:
