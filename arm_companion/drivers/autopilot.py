@@ -263,7 +263,14 @@ class Autopilot:
 
     def _on_heartbeat(self, beat: Message, now: float) -> None:
         before = self.system_id
+        stranger = self._finder.stranger
         if not self._finder.heard(beat, now):
+            if stranger == 0 and self._finder.stranger:
+                log.warning(
+                    "the autopilot, system %d, is silent and was armed: system %d does not take its place",
+                    before,
+                    self._finder.stranger,
+                )
             return
         if before not in (0, self.system_id):
             log.warning("the autopilot is system %d now, it was %d", self.system_id, before)

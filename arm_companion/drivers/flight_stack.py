@@ -72,13 +72,20 @@ def mode_name(heartbeat: Message, flavour: str) -> str:
 
 
 class AutopilotFinder:
-    """Which system the autopilot is: the first heard, until it falls silent and another speaks."""
+    """Which system the autopilot is: the first heard, until it falls silent and another speaks.
+
+    One that was armed when it was heard last stays ours however long it is silent: it may still fly, and another
+    vehicle in reach of the link must not get its set-points.
+    """
 
     def __init__(self, vehicle: VehicleConfig) -> None:
         self._timeout_s = vehicle.heartbeat_timeout_s
         self._fixed = bool(vehicle.system_id)
         self.system_id = vehicle.system_id
         """System id of the autopilot; 0 until it has been heard."""
+        self.stranger = 0
+        """System that would be the autopilot now, had ours not been armed; 0: none, or ours speaks again."""
+        self._armed = False
         self._last = float("-inf")
 
     def heard(self, heartbeat: Message, now: float) -> bool:
@@ -87,9 +94,13 @@ class AutopilotFinder:
             return False
         system = heartbeat.get_srcSystem()
         silent = now - self._last > self._timeout_s
-        if self.system_id == 0 or (not self._fixed and silent):
+        if self.system_id == 0 or (not self._fixed and silent and not self._armed):
             self.system_id = system
         if system != self.system_id:
+            if silent and not self._fixed:
+                self.stranger = system
             return False
         self._last = now
+        self._armed = bool(heartbeat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
+        self.stranger = 0
         return True

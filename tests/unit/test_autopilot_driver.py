@@ -182,6 +182,8 @@ def test_other_voices_do_not_count(fly: Callable[..., None]) -> None:
 def test_a_new_system_is_believed_only_after_the_old_one_is_silent(fly: Callable[..., None]) -> None:
     async def body(rig: Rig) -> None:
         await rig.stream(0.5)
+        rig.peer.heartbeat(PX4, OFFBOARD, armed=False)
+        await asyncio.sleep(0.01)
         rig.peer.codec.system_id = 5
         rig.peer.heartbeat(PX4, OFFBOARD)
         await asyncio.sleep(0.01)
@@ -191,6 +193,33 @@ def test_a_new_system_is_believed_only_after_the_old_one_is_silent(fly: Callable
         await asyncio.sleep(0.01)
         assert rig.autopilot.system_id == 5
         assert rig.state.position_age_s == math.inf  # the old vehicle's position is not the new one's
+
+    fly(body)
+
+
+def test_another_vehicle_never_takes_the_place_of_one_that_was_armed(
+    fly: Callable[..., None], caplog: pytest.LogCaptureFixture
+) -> None:
+    async def body(rig: Rig) -> None:
+        await rig.stream(0.5)
+        rig.peer.codec.system_id = 5
+        for _ in range(10):
+            await asyncio.sleep(1.0)
+            rig.peer.heartbeat(PX4, OFFBOARD)
+        await asyncio.sleep(0.01)
+        assert rig.autopilot.system_id == 1
+        assert rig.state.heartbeat_age_s > 9.0
+        assert caplog.text.count("system 5 does not take its place") == 1
+        rig.autopilot.send(SETPOINT, 0.0)
+        await asyncio.sleep(0.01)
+        assert {m.target_system for m in rig.peer.all("SET_POSITION_TARGET_LOCAL_NED")} == {1}
+        rig.peer.codec.system_id = 1  # it comes back and disarms: now it may be replaced
+        rig.peer.heartbeat(PX4, OFFBOARD, armed=False)
+        await asyncio.sleep(3.0)
+        rig.peer.codec.system_id = 5
+        rig.peer.heartbeat(PX4, OFFBOARD)
+        await asyncio.sleep(0.01)
+        assert rig.autopilot.system_id == 5
 
     fly(body)
 
