@@ -138,6 +138,7 @@ class MavlinkCodec:
         """Turns each frame that leaves into a signed one."""
         self._sender = _Sender(system_id, component_id)
         self._rest = b""
+        self._hidden = (-1, -1)  # where the good frame stands that the last look into a candidate found
         self._sequences: dict[int, int] = {}
 
     @property
@@ -197,7 +198,7 @@ class MavlinkCodec:
     def _scan(self, data: bytes, *, final: bool) -> list[Message]:
         messages: list[Message] = []
         counters, size, at = self.counters, len(data), 0
-        self._rest = b""
+        self._rest, self._hidden = b"", (-1, -1)
         while at < size:
             if (start := _next_magic(data, at)) > at:
                 counters.garbage += start - at
@@ -237,7 +238,7 @@ class MavlinkCodec:
         if layout is None:
             # Without CRC_EXTRA there is no check but what follows (the next frame, or nothing yet), and that
             # it is not noise in front of a real frame.
-            if (end < len(data) and data[end] not in MAGICS) or _hides_frame(data[head.magic + 1 : end]):
+            if (end < len(data) and data[end] not in MAGICS) or self._hides_frame(data, head.magic + 1, end):
                 return False
             counters.unknown += 1
             return True
@@ -247,6 +248,17 @@ class MavlinkCodec:
         counters.frames += 1
         self._count_losses(head.system << 8 | head.component, head.sequence)
         return True
+
+    def _hides_frame(self, data: bytes, start: int, end: int) -> bool:
+        """Whether a whole good frame with a known id stands somewhere between start and end.
+
+        What was found once is not searched again for the next candidate: noise may have one at every other byte,
+        and a search costs as much as all that are in it.
+        """
+        where, until = self._hidden
+        if not (start <= where and until <= end):
+            self._hidden = _find_frame(data, start, end)
+        return self._hidden[0] >= 0
 
     def _build(self, data: bytes, end: int, head: "Header") -> list[Message]:
         """The message in a genuine frame; none, and counted, when its content cannot be read."""
@@ -355,16 +367,17 @@ def _checksum_fits(data: bytes, head: Header, layout: _Layout) -> bool:
     return _crc(layout.extra, _crc(data[head.magic + 1 : end], _CRC_INIT)) == data[end] | data[end + 1] << 8
 
 
-def _hides_frame(data: bytes) -> bool:
-    """Whether a whole good frame with a known id stands somewhere in the data."""
-    for found in _ANY_MAGIC.finditer(data):
+def _find_frame(data: bytes, start: int, end: int) -> tuple[int, int]:
+    """Start and end of the first good frame with a known id that stands whole between two places; -1 twice: none."""
+    for found in _ANY_MAGIC.finditer(data, start, end):
         at = found.start()
-        if _frame_end(data, at) <= len(data):
+        until = _frame_end(data, at)
+        if until <= end:
             head = _header(data, at)
             layout = _LAYOUTS.get(head.id)
             if layout is not None and _checksum_fits(data, head, layout):
-                return True
-    return False
+                return at, until
+    return -1, -1
 
 
 def _decode(layout: _Layout, payload: bytes) -> Message:

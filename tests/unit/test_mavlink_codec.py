@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 
 from arm_companion.errors import ProtocolError
+from arm_companion.protocol import mavlink as codec_module
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import MAGIC_V1, MAGIC_V2, MavlinkCodec, Message, _slow_crc
 
@@ -148,6 +149,42 @@ def test_a_false_start_that_spans_a_real_frame_does_not_swallow_it() -> None:
     assert len(reader.feed(fake + real)) == 1
 
 
+def mavlink_1(message: Message, payload: bytes) -> bytes:
+    head = bytes([len(payload), 9, 255, 190, message.get_msgId()])
+    crc = _slow_crc(head + payload + bytes([message.crc_extra]), 0xFFFF)
+    return bytes([MAGIC_V1]) + head + payload + struct.pack("<H", crc)
+
+
+def test_no_noise_makes_the_reader_look_at_the_same_bytes_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks = 0
+    real = codec_module._frame_end
+
+    def counted(data: bytes, at: int) -> int:
+        nonlocal looks
+        looks += 1
+        return real(data, at)
+
+    monkeypatch.setattr(codec_module, "_frame_end", counted)
+    good = mavlink_1(heartbeat(), b"")
+    # At every other byte a start of a long frame with an unknown id, and in all of them the same good one.
+    noise = (bytes([MAGIC_V1, 240]) * 120 + good) * 40
+    reader = MavlinkCodec(1, 192)
+    assert len(reader.feed(noise)) == 39  # in the last piece the candidates wait for more
+    assert looks < 2 * len(noise)
+    assert len(reader.flush()) == 1
+
+
+def test_a_good_frame_is_found_in_each_of_the_candidates_around_it() -> None:
+    # The second candidate ends inside of the frame that the first one hides: it hides another one.
+    inner = mavlink_1(heartbeat(), b"")
+    outer = mavlink_1(heartbeat(), inner)
+    short = bytes([MAGIC_V1, 6 + 6 + len(inner), 0, 0, 0, 240])
+    long = bytes([MAGIC_V1, 6 + len(short) + len(outer), 0, 0, 0, 240])
+    reader = MavlinkCodec(1, 192)
+    received = [*reader.feed(long + short + outer + bytes([MAGIC_V1]) * 20), *reader.flush()]
+    assert [len(m.get_msgbuf()) for m in received] == [len(outer)]
+
+
 def test_half_a_frame_holds_a_real_one_back_only_until_the_line_is_silent() -> None:
     real = MavlinkCodec(1, 1).encode(heartbeat())
     reader = MavlinkCodec(1, 192)
@@ -166,11 +203,7 @@ def test_frames_with_unknown_incompatibility_flags_are_dropped() -> None:
 
 def test_mavlink_1_is_understood() -> None:
     message = heartbeat()
-    payload = bytes([0, 0, 0, 0, 6, 8, 0, 4, 3])
-    head = bytes([len(payload), 9, 255, 190, 0])
-    crc = _slow_crc(head + payload + bytes([message.crc_extra]), 0xFFFF)
-    frame = bytes([MAGIC_V1]) + head + payload + struct.pack("<H", crc)
-    (received,) = MavlinkCodec(1, 192).feed(frame)
+    (received,) = MavlinkCodec(1, 192).feed(mavlink_1(message, bytes([0, 0, 0, 0, 6, 8, 0, 4, 3])))
     assert (received.get_srcSystem(), received.type, received.mavlink_version) == (255, 6, 3)
 
 
