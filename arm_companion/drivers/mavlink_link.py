@@ -4,6 +4,9 @@ A PX4 autopilot drops frames that come in bursts: of 100 back to back 5 arrive, 
 everything but set-points waits its turn there, and where too much waits the oldest is dropped. Set-points are for
 the autopilot itself and do not pass through the buffer that overflows.
 
+Where set-points alone are more than the line takes, a quarter of it stays for everything else (heartbeats, answers),
+and a set-point that the line would carry too late is left out: the next is newer.
+
 No autopilot forwards our private messages. Where they have to pass one they travel inside TUNNEL, and what comes
 that way is read as if it had come directly.
 """
@@ -34,6 +37,9 @@ PX4_PACE_S: Final = 0.005
 SILENCE_S: Final = 0.05
 """Half a frame that gets no more bytes for this long is noise: the bytes of one frame never pause so."""
 
+MOST_WAIT_S: Final = 0.05
+"""A queue waits no longer for set-points, and they no longer (and for one long frame) for the line."""
+
 UNKNOWN_SYSTEM: Final = 1
 """Our system id until the autopilot's is known; the factory setting of both flight stacks."""
 
@@ -42,6 +48,8 @@ OURS: Final = range(64_000, 64_100)
 
 _TUNNEL: Final = mav.MAVLINK_MSG_ID_TUNNEL
 _BITS_PER_BYTE: Final = 10  # on a serial line, with start and stop bit
+_LONGEST_FRAME: Final = 280  # bytes, with signature
+_QUEUES_SHARE: Final = 0.25  # of the line that set-points leave to everything else
 
 _FIRST_DELAY_S: Final = 0.2
 _LONGEST_DELAY_S: Final = 5.0
@@ -67,7 +75,8 @@ class LinkCounters:
     opened: int = 0
     failed: int = 0  # times that it could not be opened
     unsent: int = 0  # messages for a link that was not open, or not yet identified
-    crowded_out: int = 0  # messages dropped from a full queue
+    crowded_out: int = 0  # messages dropped from a full queue, or left out as too late
+    late: int = 0  # urgent ones among them, left out because the line was behind
     handler_errors: int = 0
     received_bytes: int = 0
     sent_bytes: int = 0
@@ -124,7 +133,8 @@ class MavlinkLink:
         self._open_handlers: list[OpenHandler] = []
         self._transport: Transport | None = None
         self._queues: dict[int, deque[Message | bytes]] = {p: deque() for p in _QUEUE_LENGTHS}
-        self._ready_at = float("-inf")  # loop time from which the next frame of a queue may leave
+        self._ready_at = float("-inf")  # loop time at which the line has carried all that was sent
+        self._turn_at = float("-inf")  # loop time from which a frame of a queue may leave even if it has not
         self._drain_timer: asyncio.TimerHandle | None = None
         self._silence_timer: asyncio.TimerHandle | None = None
         self._heard = False
@@ -153,6 +163,11 @@ class MavlinkLink:
     def connected(self) -> bool:
         """Whether the transport is open (not: whether anybody listens)."""
         return self._transport is not None
+
+    @property
+    def bandwidth(self) -> float:
+        """Bytes per second that the link takes; 0: as many as come."""
+        return self._bandwidth
 
     @property
     def waiting(self) -> int:
@@ -227,6 +242,9 @@ class MavlinkLink:
     def _submit(self, item: Message | bytes, priority: Priority) -> None:
         if self._transport is None or not self._identified:
             self.counters.unsent += 1
+        elif priority is Priority.NOW and self._is_behind():
+            self.counters.late += 1
+            self.counters.crowded_out += 1
         elif priority is Priority.NOW or not (self._pace_s or self._bandwidth):
             self._write(item)
         else:
@@ -236,7 +254,13 @@ class MavlinkLink:
                 self.counters.crowded_out += 1
             queue.append(item)
             if self._drain_timer is None:
+                self._turn_at = max(self._turn_at, asyncio.get_running_loop().time() + MOST_WAIT_S)
                 self._drain()
+
+    def _is_behind(self) -> bool:
+        """Whether the line will be busy for longer than an urgent message may wait, and than a long frame takes."""
+        busy_s = self._ready_at - asyncio.get_running_loop().time()
+        return self._bandwidth > 0.0 and busy_s > MOST_WAIT_S + _LONGEST_FRAME / self._bandwidth
 
     async def run(self) -> None:
         """Open the link, and open it again whenever it is lost, until cancelled."""
@@ -279,6 +303,7 @@ class MavlinkLink:
             if timer is not None:
                 timer.cancel()
         self._drain_timer = self._silence_timer = None
+        self._ready_at = self._turn_at = float("-inf")
         for queue in self._queues.values():
             queue.clear()
         if self._transport is not None:
@@ -346,7 +371,8 @@ class MavlinkLink:
             message = tunnel(self._inner.encode(message), 0, 0)
         return self._codec.encode(message)
 
-    def _write(self, item: Message | bytes) -> None:
+    def _write(self, item: Message | bytes) -> int:
+        """Send it now; how many bytes it has."""
         data = item if isinstance(item, bytes) else self._encode(item)
         self.counters.sent_bytes += len(data)
         if self._bandwidth:
@@ -354,21 +380,25 @@ class MavlinkLink:
             self._ready_at = max(self._ready_at, now) + len(data) / self._bandwidth
         if self._transport is not None:
             self._transport.write(data)
+        return len(data)
 
     def _drain(self) -> None:
-        """Send the most urgent message that waits, if the line is free, and come again."""
+        """Send the most urgent message that waits, if the line is free or it is its turn, and come again."""
         self._drain_timer = None
         queue = next((q for q in self._queues.values() if q), None)
         if queue is None:
             return
         loop = asyncio.get_running_loop()
-        if loop.time() >= self._ready_at:
+        if loop.time() >= min(self._ready_at, self._turn_at):
+            size = 0
             try:
-                self._write(queue.popleft())
+                size = self._write(queue.popleft())
             except ProtocolError:
                 log.exception("link %s: message dropped", self.name)
+            share_s = size / (_QUEUES_SHARE * self._bandwidth) if self._bandwidth else 0.0
             self._ready_at = max(self._ready_at, loop.time() + self._pace_s)
-        self._drain_timer = loop.call_at(self._ready_at, self._drain)
+            self._turn_at = loop.time() + max(self._pace_s, share_s)
+        self._drain_timer = loop.call_at(min(self._ready_at, self._turn_at), self._drain)
 
 
 def _decide(choice: str, *, auto: bool) -> bool:

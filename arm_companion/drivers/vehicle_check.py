@@ -110,6 +110,7 @@ class VehicleCheck:
     ) -> None:
         self.findings: list[Finding] = []
         """What was found last, mended or not."""
+        self._link = link
         self._autopilot = autopilot
         self._flavour = vehicle.autopilot
         self._config = mavlink
@@ -130,6 +131,7 @@ class VehicleCheck:
                 await asyncio.sleep(_SETTLE_S)
                 await self.look()
             self._say(judge_rates(self._autopilot.slow_streams))
+            self._say(self._judge_line())
 
     async def look(self) -> list[Finding]:
         """Read and judge the parameters now; what is found is told once."""
@@ -146,6 +148,14 @@ class VehicleCheck:
             log.info("vehicle check: %s", ", ".join(f"{name} = {value:g}" for name, value in values.items()))
         self._say(self.findings)
         return self.findings
+
+    def _judge_line(self) -> list[Finding]:
+        """Whether the line is too slow for the set-points."""
+        if not self._link.counters.late:
+            return []
+        what = f"set-points are left out, the link to the autopilot takes only {self._link.bandwidth:.0f} bytes/s"
+        mend = "make it faster or lower rates.cycle_hz"
+        return [Finding(Severity.WARNING, what, mend, "bandwidth")]
 
     def _say(self, findings: Sequence[Finding]) -> None:
         for finding in findings:

@@ -13,11 +13,13 @@ import pytest
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config import Config
 from arm_companion.config.schema import LinkConfig, MavlinkConfig, VehicleConfig
+from arm_companion.drivers.autopilot import Autopilot
 from arm_companion.drivers.forwarding import Forwarding
 from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.link_watch import LinkWatch
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
 from arm_companion.drivers.signing_keys import SigningKeys, read_key
+from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError
 from arm_companion.mission.facts import Notice, Severity
 from arm_companion.protocol.dialect import mav
@@ -68,6 +70,109 @@ def test_a_slow_line_carries_what_it_can_the_urgent_first_and_the_newest() -> No
         assert (status.messages_sent, status.tx_overflows) == (34, 67)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+    run_simulated(main())
+
+
+def setpoint() -> Any:
+    return mav.MAVLink_set_position_target_local_ned_message(1, 1, 1, 1, 1024, *[1.0] * 9, 1.0, 0.5)
+
+
+@contextlib.asynccontextmanager
+async def to_slow_autopilot(bandwidth: float = 5760.0) -> AsyncIterator[tuple[MavlinkLink, MavlinkPeer]]:
+    peer = MavlinkPeer(1, 1)
+    config = LinkConfig("", "autopilot", bandwidth_bytes_per_s=bandwidth)
+    vehicle = dataclasses.replace(VEHICLE, autopilot="ardupilot")
+    link = MavlinkLink("slow", "autopilot", peer.pipe.opener(0), vehicle, config=config)
+    await peer.open()
+    task = asyncio.create_task(link.run())
+    await asyncio.sleep(0.01)
+    try:
+        yield link, peer
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+async def stream_setpoints(link: MavlinkLink, seconds: int) -> None:
+    """At 100 Hz, which 57600 bit/s cannot carry, with a heartbeat a second and telemetry that is too much, too."""
+    for cycle in range(100 * seconds):
+        if cycle % 100 == 0:
+            link.send(GCS)
+        link.send(setpoint(), Priority.NOW)
+        link.send(ping(cycle), Priority.BULK)
+        await asyncio.sleep(0.01)
+
+
+def test_setpoints_that_are_more_than_the_line_takes_leave_a_share_of_it() -> None:
+    async def main() -> None:
+        async with to_slow_autopilot() as (link, peer):
+            await stream_setpoints(link, 60)
+            sizes = [len(m.get_msgbuf()) for m in peer.received]
+            assert sum(sizes) / 60 == pytest.approx(5760, rel=0.02)  # the line is never asked for more than it takes
+            assert len(peer.all("HEARTBEAT")) == 60
+            assert len(peer.all("SET_POSITION_TARGET_LOCAL_NED")) > 60 * 60
+            assert sum(len(m.get_msgbuf()) for m in peer.all("PING")) > 0.2 * 5760 * 60
+            peer.received.clear()
+            link.send(GCS)
+            await asyncio.sleep(0.1)
+            assert peer.all("HEARTBEAT")  # nothing is owed when the set-points end
+            assert link.counters.late > 0
+
+    run_simulated(main())
+
+
+def test_an_answer_waits_little_for_setpoints() -> None:
+    async def main() -> None:
+        async with to_slow_autopilot() as (link, peer):
+            for cycle in range(1000):
+                link.send(setpoint(), Priority.NOW)
+                if cycle == 900:
+                    link.send(GCS)
+                if cycle == 906:
+                    assert len(peer.all("HEARTBEAT")) == 1
+                await asyncio.sleep(0.01)
+
+    run_simulated(main())
+
+
+def test_a_link_that_is_opened_again_owes_nothing() -> None:
+    async def main() -> None:
+        async with to_slow_autopilot(100.0) as (link, _):
+            for late in (5, 10):
+                for _ in range(10):
+                    link.send(setpoint(), Priority.NOW)
+                assert link.counters.late == late
+                link.close()
+                await asyncio.sleep(0.5)
+                assert link.connected
+
+    run_simulated(main())
+
+
+def test_setpoints_that_fit_are_never_left_out() -> None:
+    async def main() -> None:
+        async with to_slow_autopilot(11520.0) as (link, peer):
+            await stream_setpoints(link, 20)
+            assert link.counters.late == 0
+            assert len(peer.all("SET_POSITION_TARGET_LOCAL_NED")) == 2000
+
+    run_simulated(main())
+
+
+def test_people_are_told_once_of_a_line_that_is_too_slow_for_setpoints() -> None:
+    async def main() -> None:
+        async with to_slow_autopilot() as (link, peer):
+            said: list[Notice] = []
+            vehicle = dataclasses.replace(VEHICLE, autopilot="ardupilot")
+            check = VehicleCheck(link, Autopilot(link, vehicle), vehicle, MavlinkConfig(), said.append)
+            task = asyncio.create_task(check.run())
+            peer.heartbeat(mav.MAV_AUTOPILOT_ARDUPILOTMEGA, 4)
+            await stream_setpoints(link, 60)
+            (text,) = (notice.text for notice in said if "bytes/s" in notice.text)
+            assert "takes only 5760 bytes/s" in text
+            task.cancel()
+            await asyncio.gather(task, return_exceptions=True)
 
     run_simulated(main())
 
