@@ -1,12 +1,15 @@
 """UDP sockets as byte pipes: one that calls out, one that waits and answers who speaks to it, one that broadcasts."""
 
 import asyncio
+import logging
 import socket
 from collections.abc import Callable
 from typing import Any, cast
 
 from arm_companion.errors import LinkError
 from arm_companion.transport.base import Opener, Receiver
+
+_log = logging.getLogger(__name__)
 
 Address = tuple[Any, ...]
 
@@ -15,6 +18,9 @@ MOST_PEERS = 8
 
 PEER_SILENCE_S = 10.0
 """A peer that has been silent for this long is not written to any more, unless it is the only one."""
+
+LOOK_EVERY_S = 1.0
+"""How often a calling socket that cannot send looks whether a new one would have another address."""
 
 _MOST_AT_ONCE = 64
 _LARGEST = 65_536
@@ -42,9 +48,10 @@ class UdpTransport(asyncio.DatagramProtocol):
         self._closed = asyncio.Event()
         self._full = False
         self._peers: dict[Address, float] = {}  # loop time at which each spoke last, the newest at the end
+        self._look_at = float("-inf")  # loop time of the next look
         self.dropped = 0
         self.refused = 0
-        """Times that the network said that nobody listens at the other end."""
+        """Times that the network said that nobody listens at the other end, or that there is no way."""
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """The socket is open (called by asyncio)."""
@@ -66,9 +73,23 @@ class UdpTransport(asyncio.DatagramProtocol):
             self._remember(addr)
         self._receiver(data)
 
-    def error_received(self, exc: Exception) -> None:  # noqa: ARG002 - asyncio's signature
-        """Survive what ICMP reports: a peer that is not there yet may come."""
+    def error_received(self, exc: Exception) -> None:
+        """Survive what ICMP reports, as a peer that is not there yet may come.
+
+        But a calling socket keeps the address that it was opened with. When this computer gets another one (DHCP, a
+        mobile network) only a new socket can send, so this one ends.
+        """
         self.refused += 1
+        if self._socket is None or self._learns or self._broadcast or isinstance(exc, ConnectionRefusedError):
+            return
+        now = asyncio.get_running_loop().time()
+        if now < self._look_at:
+            return
+        self._look_at = now + LOOK_EVERY_S
+        fresh = _address_towards(self._plain.family, self._socket.get_extra_info("peername"))
+        if fresh not in ("", self.local[0]):
+            _log.warning("udp: this computer is %s now, it was %s (%s)", fresh, self.local[0], exc)
+            self._socket.abort()
 
     def pause_writing(self) -> None:
         """The kernel takes no more and enough waits here already: drop until it does."""
@@ -171,6 +192,16 @@ def udp_broadcast(host: str, port: int) -> Opener:
             raise LinkError(f"cannot broadcast to udp {host}:{port}: {error}") from error
 
     return open_socket
+
+
+def _address_towards(family: int, peer: Address) -> str:
+    """The address that a new socket would send to a peer from; empty when there is no way."""
+    with socket.socket(family, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(peer)  # sends nothing
+        except OSError:
+            return ""
+        return str(probe.getsockname()[0])
 
 
 async def _socket(host: str, port: int) -> tuple[socket.socket, Address]:

@@ -1,6 +1,7 @@
 """Transports: UDP sockets on the loopback, the memory pipe, and the URLs that name them."""
 
 import asyncio
+import errno
 import socket
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -166,6 +167,65 @@ def test_a_refusal_is_survived_and_the_peer_may_come_later() -> None:
         await asyncio.gather(caller.wait_closed(), pipe.wait_closed())
 
     run(main())
+
+
+def test_a_calling_socket_ends_once_this_computer_has_another_address(monkeypatch: pytest.MonkeyPatch) -> None:
+    looks: list[str] = []
+
+    def towards(address: str) -> None:
+        def look(*_: Any) -> str:
+            looks.append(address)
+            return address
+
+        monkeypatch.setattr(udp, "_address_towards", look)
+
+    async def main() -> None:
+        pipe, port = await waiting([])
+        caller = await udp_out(HOST, port)(lambda _: None)
+        assert isinstance(caller, UdpTransport)
+        gone = asyncio.create_task(caller.wait_closed())
+        no_way = OSError(errno.ENETUNREACH, "Network is unreachable")
+        monkeypatch.setattr(udp, "LOOK_EVERY_S", 0.0)
+        for address in ("", HOST):  # no network yet; and as it was: a new socket would do no better
+            towards(address)
+            caller.error_received(no_way)
+        towards("127.0.0.2")
+        caller.error_received(ConnectionRefusedError())
+        await asyncio.sleep(0.01)
+        assert not gone.done()
+        caller.error_received(no_way)
+        await asyncio.wait_for(gone, 1.0)
+        assert looks == ["", HOST, "127.0.0.2"]
+        pipe.error_received(no_way)  # one that waits has no address to keep
+        pipe.write(b"!")
+        pipe.close()
+        await pipe.wait_closed()
+        assert len(looks) == 3
+
+    run(main())
+
+
+def test_a_flood_of_errors_costs_one_look(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def main() -> None:
+        pipe, port = await waiting([])
+        caller = await udp_out(HOST, port)(lambda _: None)
+        assert isinstance(caller, UdpTransport)
+        looks: list[Any] = []
+        monkeypatch.setattr(udp, "LOOK_EVERY_S", 1000.0)
+        monkeypatch.setattr(udp, "_address_towards", lambda *seen: looks.append(seen) or "")
+        for _ in range(100):
+            caller.error_received(OSError(errno.EHOSTUNREACH, "No route to host"))
+        assert looks == [(socket.AF_INET, (HOST, port))]
+        for transport in (caller, pipe):
+            transport.close()
+            await transport.wait_closed()
+
+    run(main())
+
+
+def test_the_address_towards_a_peer_is_what_a_new_socket_has() -> None:
+    assert udp._address_towards(socket.AF_INET, (HOST, 9)) == HOST
+    assert udp._address_towards(socket.AF_INET, ("255.255.255.255", 9)) == ""  # a broadcast is not allowed
 
 
 def test_a_closed_socket_stays_closed() -> None:
