@@ -1,8 +1,14 @@
-"""Signing keys and time stamps on disk."""
+"""Signing keys and time stamps on disk.
+
+A time stamp must not be used twice, also after a power cut and with a clock that is wrong then. So while the daemon
+runs the file has a stamp that will not be passed before the file is written again; a restart goes on behind it. Stamps
+that are ahead of the clock must not get farther ahead with each restart, or a ground station with the right time is
+locked out after some: what is reserved counts from the clock, and beyond that only for the frames sent meanwhile.
+"""
 
 import logging
 import stat
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -12,12 +18,15 @@ from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.settings import state_directory
 from arm_companion.errors import ConfigError
-from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing
+from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing, stamp_at
 
 log = logging.getLogger(__name__)
 
 KEEP_EVERY_S: Final = 10.0
-"""How often the time stamps are written; a restart begins as much later, so that none is used twice."""
+"""How often the time stamps are written."""
+
+_RESERVED: Final = int(2 * KEEP_EVERY_S * UNITS_PER_S)
+_LEAST_RESERVED: Final = UNITS_PER_S  # as many frames, each of which uses one stamp
 
 
 def read_key(path: Path) -> bytes:
@@ -58,7 +67,9 @@ class SigningKeys:
     def __init__(self, config: Config, keeper: Keeper) -> None:
         self._keeper = keeper
         self._directory = state_directory(config)
+        self._unix: Callable[[], float] = lambda: 0.0
         self._kept: dict[Path, Signing] = {}
+        self._last: dict[Path, int] = {}  # stamps at the last writing
         self._by_link: dict[str, Signing] = {}
         for number, (name, link) in enumerate(config.links.items()):
             if not link.signing_key:
@@ -71,28 +82,38 @@ class SigningKeys:
             signing = Signing(read_key(Path(link.signing_key)), number, stamp)
             self._by_link[name] = signing
             if self._directory is not None:
-                self._kept[self._directory / f"signing-{name}"] = signing
+                file = self._directory / f"signing-{name}"
+                self._kept[file], self._last[file] = signing, stamp
 
     def secure(self, links: Sequence[MavlinkLink], clock: Clock) -> None:
         """Sign on those links that have a key."""
+        self._unix = lambda: clock.unix(clock.now())
         for link in links:
             if (signing := self._by_link.get(link.name)) is not None:
-                link.secure(signing, lambda: clock.unix(clock.now()))
+                link.secure(signing, self._unix)
 
     async def run(self) -> None:
-        """Keep the time stamps again and again, until cancelled."""
+        """Reserve time stamps again and again, until cancelled."""
         async for _ in ticks(KEEP_EVERY_S):
-            self.keep()
+            for file, signing in self._kept.items():
+                # a peer whose clock is ahead pulls ours along as fast as it goes
+                pace = 2 * (signing.stamp - self._last[file])
+                ahead = signing.stamp + min(max(pace, _LEAST_RESERVED), _RESERVED)
+                self._last[file] = signing.stamp
+                self._put(file, max(ahead, stamp_at(self._unix()) + _RESERVED))
 
     def keep(self) -> None:
-        """Write the time stamps now."""
+        """Write the time stamps at the end, when none is used any more: what was reserved is free again."""
         for file, signing in self._kept.items():
-            self._keeper.put(file, str(signing.stamp).encode() + b"\n")
+            self._put(file, signing.stamp)
+
+    def _put(self, file: Path, stamp: int) -> None:
+        self._keeper.put(file, str(stamp).encode() + b"\n")
 
 
 def _read_stamp(file: Path) -> int:
     try:
-        return int(file.read_text(encoding="ascii")) + int(2 * KEEP_EVERY_S * UNITS_PER_S)
+        return int(file.read_text(encoding="ascii"))
     except FileNotFoundError:
         return 0
     except (OSError, ValueError) as error:

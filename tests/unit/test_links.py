@@ -23,6 +23,7 @@ from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError
 from arm_companion.mission.facts import Notice, Severity
 from arm_companion.protocol.dialect import mav
+from arm_companion.protocol.mavlink import Header, MavlinkCodec
 from arm_companion.protocol.signing import Signing, stamp_at
 from tests.conftest import MavlinkPeer
 from tests.unit.component_rig import GCS, ServiceRig, serve
@@ -274,15 +275,101 @@ def test_a_key_file_must_be_private_and_a_key(tmp_path: Path) -> None:
             read_key(file)
 
 
-def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) -> None:
-    key = tmp_path / "key"
+def signing_config(directory: Path) -> Config:
+    key = directory / "key"
     key.write_bytes(KEY)
     key.chmod(0o600)
-    config = dataclasses.replace(
+    return dataclasses.replace(
         Config(),
         links={"ground": LinkConfig("", signing_key=str(key)), "open": LinkConfig("")},
-        mavlink=MavlinkConfig(state_directory=str(tmp_path)),
+        mavlink=MavlinkConfig(state_directory=str(directory)),
     )
+
+
+class Start:
+    """A start of the daemon as signing sees it, with a clock that is wrong by `off_s`."""
+
+    def __init__(self, config: Config, off_s: float = 0.0) -> None:
+        self.keeper = Keeper()
+        self.keys = SigningKeys(config, self.keeper)
+        self.signing = self.keys._by_link["ground"]
+        self.keys.secure([], Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S + off_s))
+        self.off_s = off_s
+        self.used: list[int] = []
+
+    async def live(self, seconds: int, *, orderly: bool = False) -> None:
+        """Send a frame ten times a second; then the power is cut, unless it is an orderly end."""
+        task = asyncio.create_task(self.keys.run())
+        codec = MavlinkCodec(1, 192)
+        for _ in range(10 * seconds):
+            await asyncio.sleep(0.1)
+            self.signing.sign(codec.encode(GCS), right_time() + self.off_s)
+            self.used.append(self.signing.stamp)
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+        if orderly:
+            self.keys.keep()
+        self.keeper.close()
+
+
+def right_time() -> float:
+    return SIMULATED_EPOCH_S + asyncio.get_running_loop().time()
+
+
+@pytest.mark.parametrize("off_s", [-1e6, -12.0, -5.0, 0.0])
+def test_no_time_stamp_is_used_twice_whatever_clock_follows_a_power_cut(tmp_path: Path, off_s: float) -> None:
+    config = signing_config(tmp_path)
+
+    async def main() -> None:
+        newest = 0
+        for off in (0.0, off_s, off_s, 0.0):
+            start = Start(config, off)
+            await start.live(19)
+            assert newest < start.used[0]
+            assert start.used == sorted(set(start.used))
+            newest = start.used[-1]
+
+    run_simulated(main())
+
+
+def test_a_peer_that_is_ahead_pulls_our_time_stamps_along_and_none_is_used_twice(tmp_path: Path) -> None:
+    config = signing_config(tmp_path)
+
+    async def main() -> None:
+        start = Start(config)
+        pulls = asyncio.create_task(start.live(35))
+        for _ in range(34):
+            await asyncio.sleep(1.0)
+            start.signing.stamp = stamp_at(right_time() + 1000.0)
+        await pulls
+        again = Start(config)
+        await again.live(1)
+        assert start.used[-1] < again.used[0]
+
+    run_simulated(main())
+
+
+@pytest.mark.parametrize(("seconds", "orderly"), [(4, True), (4, False), (11, False)])
+def test_restarts_in_a_row_lock_no_ground_station_out(tmp_path: Path, seconds: int, orderly: bool) -> None:
+    config = signing_config(tmp_path)
+
+    async def main() -> None:
+        ground, codec = Signing(KEY, 9), MavlinkCodec(255, 190)
+        newest = 0
+        for _ in range(20):
+            start = Start(config)
+            await start.live(seconds, orderly=orderly)
+            assert newest < start.used[0]
+            newest = start.used[-1]
+            frame = ground.sign(codec.encode(GCS), right_time())
+            head = Header(1, 0, 255, 190, 0, 0, 10, len(frame) - 15)
+            assert start.signing.accept(frame, head, right_time())
+
+    run_simulated(main())
+
+
+def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) -> None:
+    config = signing_config(tmp_path)
     later = stamp_at(SIMULATED_EPOCH_S + 1e6)
 
     async def main() -> None:
@@ -296,7 +383,9 @@ def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) ->
         link = MavlinkLink("ground", "ground", peer.pipe.opener(0), VEHICLE, config=config.links["ground"])
         second.secure([link], Clock(asyncio.get_running_loop(), SIMULATED_EPOCH_S))
         assert link.signing is not None
-        assert link.signing.stamp > later
+        assert link.signing.stamp == later  # the daemon ended as it should: exactly as much is used
+        link.codec.encode(GCS)
+        assert link.signing.stamp == later + 1
         (tmp_path / "signing-ground").write_text("rubbish")
         assert SigningKeys(config, keeper)._by_link["ground"].stamp == 0
 
