@@ -75,6 +75,24 @@ CAUSES: tuple[Cause, ...] = (
         "no set-points; goes on with the arm alone",
     ),
     Cause(
+        "pilot takes the mode, an arm above still wrapped",
+        ArmFault.PILOT_TOOK_OVER,
+        (hang.taken_before_it_opens,),
+        "as with any arm; one whose load the pilot has taken back himself goes on letting go",
+    ),
+    Cause(
+        "autopilot failsafe, an arm above still wrapped",
+        ArmFault.AUTOPILOT_FAILSAFE,
+        (hang.failsafe_before_it_opens,),
+        "as with any arm",
+    ),
+    Cause(
+        "motors drop while an arm above lets go",
+        ArmFault.SETPOINT_REJECTED,
+        (hang.motors_drop,),
+        "not judged: the arm does not let go; in RELEASE nothing once it is half open, as it can hold nothing then",
+    ),
+    Cause(
         "disarm",
         ArmFault.DISARMED,
         (hazards.disarmed, hazards.motors_stopped),
@@ -283,6 +301,7 @@ Made from the tables in `arm_companion/mission/`: `perch.py`, `hang.py`, `grasp.
   vehicle that hangs on an arm with a dead servo is better off than one that falls.
 - An arm that may carry a vehicle whose motors idle or stand never opens. What goes wrong with it brings the motors up
   (TAKE_BACK), if the vehicle is ours; if it is not, the arm holds (HANG_HOLD) until a person has the motors carry it.
+  It holds again when the vehicle is taken from us, or its motors drop, before the arm has opened.
 - An arm above that is found or left HOLDING goes on to HANG_HOLD at once.
 - A calibration is on the ground, and nothing depends on the arm: it is given up for anything. The tendons go back to
   where they were, the torque becomes what it was, and the zeros that were in force stay.

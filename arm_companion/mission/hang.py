@@ -4,6 +4,8 @@ An arm that may carry a vehicle opens for nobody before the motors carry it: eve
 through TAKE_BACK, which ends by the throttle, and what cannot be taken back is held in HANG_HOLD.
 """
 
+import math
+
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission import sharing
 from arm_companion.mission.facts import ArmFault, Control, Order
@@ -32,6 +34,7 @@ HUNG = frozenset({Phase.LOAD_TRANSFER, Phase.HANGING})
 """Phases in which the arm carries more and more of the vehicle, or all that it shall."""
 
 _STOWED_ONLY = frozenset({Phase.STOWED})
+_UNLOAD = frozenset({Phase.UNLOAD})
 _IDLE_MARGIN = 0.2  # of hover thrust, by which the motors may idle higher than asked
 
 
@@ -86,6 +89,35 @@ def load_late(s: Situation) -> str | None:
 def taken_from_us(s: Situation) -> str | None:
     """The autopilot left our mode while we took the load back; a pilot who had it before may go on lifting."""
     return pilot_takes_over(s) if s.state.control is Control.EXTERNAL else None
+
+
+def taken_before_it_opens(s: Situation) -> str | None:
+    """The same, with the load taken back and the arm still whole: nobody knows what the stick asks of the motors.
+
+    A pilot who has lifted it himself had the vehicle before, and is left to it.
+    """
+    return _still_wrapped(s, taken_from_us(s))
+
+
+def failsafe_before_it_opens(s: Situation) -> str | None:
+    """An autopilot that begins an emergency with the arm still whole may land the vehicle on it."""
+    return _still_wrapped(s, failsafe(s))
+
+
+def _still_wrapped(s: Situation, reason: str | None) -> str | None:
+    return f"{reason}, the arm is still wrapped" if s.arm_above and reason is not None else None
+
+
+def motors_drop(s: Situation) -> str | None:
+    """The motors no longer carry the vehicle, and the arm is still so far around the bar that it can."""
+    half = 0.5 * s.config.perch.wrap_bend_rad
+    if not s.arm_above or not sharing.dropped(s) or (s.state.phase is Phase.RELEASE and _bend(s) < half):
+        return None
+    return f"the motors no longer carry the vehicle: throttle {s.facts.vehicle.throttle:.0%}"
+
+
+def _bend(s: Situation) -> float:
+    return math.hypot(*s.state.bend)
 
 
 # --- orders ---
@@ -151,6 +183,15 @@ ABORTS: tuple[Row, ...] = (
             (HUNG, overstressed, "over-tension", ArmFault.TENDON_OVER_TENSION),
             (HUNG, wrench_over_limit, "wrench limit", ArmFault.WRENCH_LIMIT),
             (frozenset({Phase.LOAD_TRANSFER}), throttle_lost, "throttle not known", ArmFault.VEHICLE_STATE_STALE),
+        )
+    ),
+    # the load is taken back, and the vehicle may still come down onto an arm that opens: it is held again
+    *(
+        Row(phases, guard, Phase.HOLDING, name, error)
+        for phases, guard, name, error in (
+            (_UNLOAD, taken_before_it_opens, "pilot takes over, arm above", ArmFault.PILOT_TOOK_OVER),
+            (_UNLOAD, failsafe_before_it_opens, "autopilot failsafe, arm above", ArmFault.AUTOPILOT_FAILSAFE),
+            (_UNLOAD | {Phase.RELEASE}, motors_drop, "motors drop, arm above", ArmFault.SETPOINT_REJECTED),
         )
     ),
 )

@@ -20,9 +20,13 @@ SUSPENDED = SHARING | {Phase.HANG_HOLD}
 """Phases in which the arm may be all that keeps the vehicle from falling."""
 
 _HOVERING = frozenset({Phase.APPROACH, Phase.REACH})
+_LETS_GO = frozenset({Phase.UNLOAD, Phase.RELEASE})
 _HOVER_S = 2.0  # the hover's throttle is a mean over so long
 _PLACE_S = 3.0  # a slip is a move away from where the vehicle was on the mean of so long
 _CARRIED_S = 1.0
+_DROPPED_SHARE = 0.7  # of hover thrust, under which the vehicle falls by 3 m/s^2, or leans on the arm
+_DROPPED_S = 0.2
+_LEAST_THROTTLE = 0.25  # with which a vehicle may fly whose hover's throttle nobody knows
 _TRIM_PER_S = 0.3  # of the throttle's miss, slower than any autopilot's own loops
 _TRIM_MAX = 2.0  # m/s^2
 _URGENT = 4.0  # times faster when something is wrong
@@ -65,7 +69,7 @@ def keep_sharing(s: Situation) -> Sharing:
         share = s.dt / (_HOVER_S + s.dt) if load.hover > 0.0 else 1.0
         return replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
     if s.state.phase not in SHARING:
-        return load
+        return replace(load, dropped_s=load.dropped_s + s.dt if _motors_drop(s) else 0.0)
     away = sub(s.state.position, load.place)
     rests = load.share == load.step and norm(away) < hang.rest_m
     return replace(
@@ -87,6 +91,19 @@ def _motors_carry(s: Situation) -> bool:
 def carried(s: Situation) -> bool:
     """Whether the motors have carried the vehicle for long enough to let go."""
     return s.state.sharing.carried_s >= _CARRIED_S
+
+
+def _motors_drop(s: Situation) -> bool:
+    """Whether the motors do not carry the vehicle while the arm lets go of the bar; not judged without a throttle."""
+    if s.state.phase not in _LETS_GO or not throttle_known(s):
+        return False
+    share = motor_share(s)
+    return s.facts.vehicle.throttle < _DROPPED_SHARE * _LEAST_THROTTLE if share is None else share < _DROPPED_SHARE
+
+
+def dropped(s: Situation) -> bool:
+    """Whether the motors have let the vehicle down for so long that it is no manoeuvre."""
+    return s.state.sharing.dropped_s >= _DROPPED_S
 
 
 # --- what is done about it ---

@@ -183,6 +183,7 @@ class Sharing:
         trim: acceleration that makes the measured throttle the asked one, m/s^2 down.
         rested_s: for how long the vehicle has been at rest in this step.
         carried_s: for how long the motors have carried the vehicle again.
+        dropped_s: for how long they no longer have, while the arm lets go.
         place: of the vehicle, m, followed slowly: a slip is a fast move away from it.
         first: height of the vehicle when the load began to move, m, NED.
     """
@@ -193,6 +194,7 @@ class Sharing:
     trim: float = 0.0
     rested_s: float = 0.0
     carried_s: float = 0.0
+    dropped_s: float = 0.0
     place: Vec3 = ZERO
     first: float = 0.0
 

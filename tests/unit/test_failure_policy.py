@@ -40,6 +40,7 @@ from tests.unit.mission_rig import (
     BENT,
     COURSE,
     HELD,
+    HUNG,
     PLACE,
     T0,
     Change,
@@ -86,6 +87,7 @@ class Provocation:
         blind: the mechanics have no solution.
         stall_s: length of the last cycle.
         gripper: the arm has one, on a servo.
+        above: the arm is above the vehicle.
     """
 
     words: str
@@ -96,6 +98,7 @@ class Provocation:
     blind: bool = False
     stall_s: float = 0.01
     gripper: bool = False
+    above: bool = False
 
 
 def _remember(**fields: object) -> Callable[[State], State]:
@@ -159,6 +162,15 @@ PROVOCATIONS: dict[str, Provocation] = {
     "vehicle state stale": Provocation("vehicle state is 1.00 s old", vehicle(position_age_s=1.0)),
     "pilot takes the mode": Provocation("pilot has the vehicle", vehicle(control=Control.PILOT, mode="POSCTL")),
     "autopilot failsafe": Provocation("autopilot failsafe", vehicle(control=Control.FAILSAFE, mode="RTL")),
+    "pilot takes the mode, an arm above still wrapped": Provocation(
+        "still wrapped", vehicle(control=Control.PILOT, mode="STABILIZED"), above=True
+    ),
+    "autopilot failsafe, an arm above still wrapped": Provocation(
+        "still wrapped", vehicle(control=Control.FAILSAFE, mode="LAND"), above=True
+    ),
+    "motors drop while an arm above lets go": Provocation(
+        "no longer carry", vehicle(throttle=0.2), _remember(sharing=HUNG), seconds=0.25, above=True
+    ),
     "disarm": Provocation("disarmed", vehicle(armed=False)),
     "ground station lost": Provocation("ground station silent", lambda f: dataclasses.replace(f, ground_age_s=6.0)),
     "operator aborts": Provocation("order ABORT", lambda f: ask(f, Order.ABORT)),
@@ -225,6 +237,14 @@ NO_BIT = {"contact lost"}
 CELLS = [(cause, situation) for cause in CAUSES for situation in SITUATIONS if cause.name not in ELSEWHERE]
 
 
+def turned_up(parameters: Parameters) -> Parameters:
+    """The same arm above the vehicle."""
+    config = parameters.config
+    mount = dataclasses.replace(config.mount, rpy_deg=(180.0, 0.0, 0.0))
+    limits = dataclasses.replace(config.limits, keep_out=dataclasses.replace(config.limits.keep_out, half_angle_deg=0))
+    return Parameters(dataclasses.replace(config, mount=mount, limits=limits), parameters.model)
+
+
 def provoke(cause: Cause, phase: Phase, parameters: Parameters, facts: Facts) -> Run:
     """The cause in a phase, until its facts have held for as long as they say."""
     how = PROVOCATIONS[cause.name]
@@ -233,6 +253,8 @@ def provoke(cause: Cause, phase: Phase, parameters: Parameters, facts: Facts) ->
         parameters = Parameters(parameters.config, Blind(parameters.model.parameters))
     if how.gripper:
         parameters = gripping(parameters)
+    if how.above:
+        parameters = turned_up(parameters)
     run = Run(how.recall(memory(phase)), parameters)
     if how.quiet_s:
         run.cycles(facts, how.quiet_s)

@@ -183,6 +183,53 @@ def test_the_pilot_takes_it_while_it_hangs_and_lifts_it_off_himself(hanging: Bar
     assert all(said.setpoint is None for said in bar.run.said[-500:])
 
 
+def leaving(phase: Phase, bend: tuple[float, float] = BENT, **fields: object) -> State:
+    """Memory of a hung vehicle whose load has just been taken back."""
+    sharing = Sharing(hover=HOVER_THROTTLE, place=PLACE, first=PLACE[2])
+    goal = (0.0, 0.0) if phase is Phase.RELEASE else bend
+    known = {"kind": PerchKind.HANG, "bend": bend, "bend_goal": goal, "sharing": sharing, "rest": PLACE}
+    return memory(phase, **{**known, **fields})
+
+
+@pytest.mark.parametrize("control", [Control.PILOT, Control.FAILSAFE])
+def test_a_vehicle_taken_from_us_before_the_arm_opens_is_held_again(
+    control: Control, above: Parameters, wrapped: Facts
+) -> None:
+    run = Run(leaving(Phase.UNLOAD), above)
+    run.cycles(wrapped, 0.1)
+    run.cycles(vehicle(control=control, mode="STABILIZED", throttle=0.0)(wrapped), 3.0)
+    assert run.phases == [Phase.UNLOAD, Phase.HOLDING, Phase.HANG_HOLD]
+    assert all(said.pulls is None for said in run.said[10:])
+
+
+@pytest.mark.parametrize("control", [Control.PILOT, Control.EXTERNAL])
+@pytest.mark.parametrize("phase", [Phase.UNLOAD, Phase.RELEASE])
+def test_motors_that_drop_before_the_arm_has_opened_have_it_hold_again(
+    phase: Phase, control: Control, above: Parameters, wrapped: Facts
+) -> None:
+    flown = vehicle(control=control, mode="STABILIZED")(wrapped)
+    run = Run(leaving(phase, control=control), above)
+    run.cycles(flown, 0.2)
+    run.cycles(vehicle(throttle=0.6 * HOVER_THROTTLE)(flown), 0.1)
+    run.cycles(flown, 0.1)
+    assert run.phases == [phase], "a manoeuvre"
+    run.cycles(vehicle(throttle=0.6 * HOVER_THROTTLE)(flown), 0.3)
+    assert run.phases == [phase, Phase.HOLDING, Phase.HANG_HOLD]
+
+
+def test_motors_that_nobody_knows_the_hover_of_drop_when_they_idle(above: Parameters, wrapped: Facts) -> None:
+    for throttle, phases in ((0.3, [Phase.UNLOAD]), (0.1, [Phase.UNLOAD, Phase.HOLDING, Phase.HANG_HOLD])):
+        run = Run(leaving(Phase.UNLOAD, control=Control.PILOT, sharing=Sharing()), above)
+        run.cycles(vehicle(control=Control.PILOT, throttle=throttle)(wrapped), 0.5)
+        assert run.phases == phases
+
+
+def test_an_arm_that_is_half_open_goes_on_opening(above: Parameters, wrapped: Facts) -> None:
+    run = Run(leaving(Phase.RELEASE, bend=(2.0, 0.0)), above)
+    run.cycles(vehicle(throttle=0.1)(wrapped), 0.5)
+    assert run.phases == [Phase.RELEASE]
+
+
 @pytest.mark.parametrize(
     "order", [Order.RELEASE, Order.STOW, Order.ABORT, Order.READY, Order.PERCH, Order.CLEAR_ERRORS]
 )
