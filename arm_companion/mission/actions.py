@@ -39,6 +39,7 @@ _REFERENCE_RESTS = CALIBRATES | frozenset(
         Phase.CARRY,
     }
 )
+_FREE = frozenset({Phase.READYING, Phase.STOWING, Phase.STOWED})
 _ORDER_OF_PERCH = (
     Phase.APPROACH,
     Phase.REACH,
@@ -91,9 +92,9 @@ def _prepare(s: Situation) -> State:
         case Phase.READYING | Phase.STOWING | Phase.RELEASE:
             # from where the arm really is, so that torque coming on never jerks it
             bend = s.bend if _at_rest(s) else state.bend
-            return replace(state, bend=bend, bend_goal=(0.0, 0.0), pulls=())
+            return replace(_of_this_bar(s), bend=bend, bend_goal=(0.0, 0.0), pulls=())
         case Phase.HOLDING | Phase.STOWED:
-            return replace(state, bend=s.bend, bend_goal=s.bend, pulls=(), course=None)
+            return replace(_of_this_bar(s), bend=s.bend, bend_goal=s.bend, pulls=(), course=None)
         case Phase.APPROACH:
             return replace(
                 state,
@@ -125,6 +126,13 @@ def _prepare(s: Situation) -> State:
         case Phase.UNLOAD:
             return replace(state, offset=ZERO, bend_goal=state.bend)
     return state
+
+
+def _of_this_bar(s: Situation) -> State:
+    """Memory at the entry of a phase in which the arm is free, or lets go, or holds whatever it may be around."""
+    if s.state.phase in _FREE:
+        return replace(s.state, contact_w=None, anchor=None, rest=None)
+    return s.state if s.grasping else s.without_far_bar()  # a load is let go wherever it has been carried to
 
 
 def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
@@ -258,10 +266,11 @@ def _reference(s: Situation) -> Reference | None:
         return replace(reference, velocity=ZERO)
     if state.phase in SHARING:
         return hung_reference(s, reference)
-    if state.phase is Phase.RELEASE and state.contact_w == ZERO:  # after a restart nobody knows where the bar was met
-        return replace(reference, velocity=ZERO)
     if state.phase in (*_CURLS, Phase.RELEASE):
-        return Reference(_beside_bar(s), ZERO, state.heading)
+        beside = _beside_bar(s)
+        if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(beside)):
+            return replace(reference, velocity=ZERO)  # nobody knows where the bar was met
+        return Reference(beside, ZERO, state.heading)
     goal, speed = _goal(s)
     return follow(
         reference,
@@ -297,20 +306,20 @@ def _beside_bar(s: Situation) -> Vec3:
     """
     state, perch = s.state, s.config.perch
     if s.gripping:  # the straight arm has nothing to curl around
-        return state.contact_w
+        return s.contact_w
     share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
-    closed = add(state.contact_w, scale(s.straight_w, perch.contact_arc_m))
+    closed = add(s.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
         closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
     # forward first, while the curl is still wide; and away from the bar before anything can hook into it
     leaves = state.phase is Phase.RELEASE and not s.grasping and state.kind is PerchKind.ANCHOR
     forward = 1.0 if leaves else _FORWARD_SHARE
     ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / forward, 0.0))
-    return add(add(s.state.contact_w, scale(sub(closed, s.state.contact_w), share)), ahead)
+    return add(add(s.contact_w, scale(sub(closed, s.contact_w), share)), ahead)
 
 
 def _clear_of_bar(s: Situation) -> Vec3:
-    return add(s.state.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
+    return add(s.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
 
 
 def _goal(s: Situation) -> tuple[Vec3, float]:

@@ -169,7 +169,7 @@ def goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes in REACH and CONTACT, from above, and how fast; closed jaws wait at the stand-off."""
     perch = s.config.perch
     if s.state.phase is Phase.CONTACT:
-        return s.state.contact_w, perch.reach_speed_m_per_s
+        return s.contact_w, perch.reach_speed_m_per_s
     if not is_open(s):
         return s.standoff, perch.reach_speed_m_per_s
     far = _above_grip(s) > _NEAR_M
@@ -178,7 +178,7 @@ def goal(s: Situation) -> tuple[Vec3, float]:
 
 def lifted_from(s: Situation) -> Vec3:
     """Vehicle position from which the test lift begins, and to which the object is brought back: above the grip."""
-    x, y, _ = s.state.contact_w
+    x, y, _ = s.contact_w
     return x, y, s.state.position[2]
 
 

@@ -192,7 +192,7 @@ def cannot_depart(s: Situation) -> str | None:
         return None
     if not s.external:
         return "arm clear; the vehicle is not ours to move"
-    return "arm clear; where the bar was met is not known" if s.state.contact_w == ZERO else None
+    return "arm clear; where the bar was met is not known" if s.state.contact_w is None else None
 
 
 # --- orders: what a person may ask, and when ---

@@ -111,7 +111,7 @@ def dropped(s: Situation) -> bool:
 
 def begin(s: Situation) -> State:
     """Memory at the entry of the present phase, which is one of SUSPENDED."""
-    state, load, position = s.state, s.state.sharing, s.state.position
+    state, load, position = s.without_far_bar(), s.state.sharing, s.state.position
     fresh = replace(load, rested_s=0.0, carried_s=0.0)
     match state.phase:
         case Phase.LOAD_TRANSFER:

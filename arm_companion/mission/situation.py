@@ -288,7 +288,7 @@ class Situation:
         """Vehicle position at the stand-off: before the target, or before the place where an object was let go."""
         distance = self.config.perch.standoff_m
         if self.grasping and self.state.phase is Phase.DEPART:
-            return sub(self.state.contact_w, scale(self.straight_w if self.gripping else self.ahead, distance))
+            return sub(self.contact_w, scale(self.straight_w if self.gripping else self.ahead, distance))
         return self.place(distance)
 
     @property
@@ -342,6 +342,27 @@ class Situation:
     def rest(self) -> Vec3:
         """Vehicle position in which the anchored arm asks for nothing."""
         return self.probe if self.state.rest is None else self.state.rest
+
+    @property
+    def contact_w(self) -> Vec3:
+        """Vehicle position at which bar or object was met; unknown, the vehicle stays."""
+        if self.state.contact_w is not None:
+            return self.state.contact_w
+        reference = self.state.reference
+        return self.facts.vehicle.position_w if reference is None else reference.position
+
+    def far(self, place: Vec3 | None) -> bool:
+        """Whether a place that is remembered of a bar is too far away to be where the arm is wrapped now."""
+        most = _ELSEWHERE_M + self.config.perch.contact_arc_m
+        return place is not None and norm(sub(place, self.facts.vehicle.position_w)) > most
+
+    def without_far_bar(self) -> State:
+        """Memory in which a bar that is elsewhere is forgotten: of another flight, or in another frame."""
+        state = self.state
+        anchor = None if state.anchor is None else state.anchor.position_w
+        if not any(self.far(place) for place in (state.contact_w, anchor, state.rest)):
+            return state
+        return replace(state, contact_w=None, anchor=None, rest=None)
 
     def heading_to_bar(self) -> float:
         """Heading across the bar's axis, on the side on which the vehicle is now, rad."""

@@ -248,7 +248,7 @@ class State:
     streamed: bool = False  # the goal comes from a stream of set-points
     pulls: tuple[float, ...] = ()  # m, tendon goals that belong to `bend`; empty: not found yet
     reference: Reference | None = None
-    contact_w: Vec3 = ZERO  # m, vehicle reference when contact was found
+    contact_w: Vec3 | None = None  # m, vehicle reference when contact was found; None: nobody knows where
     heading: float = 0.0  # rad, at which the vehicle faces the bar
     force: ForceObserver = ForceObserver()
     tension: tuple[float, ...] = ()  # N, smoothed, each while its servo moved last

@@ -95,7 +95,7 @@ def _move_frame(s: Situation, leap: Vec3) -> State:
     return replace(
         state,
         reference=None if reference is None else replace(reference, position=add(reference.position, leap)),
-        contact_w=add(state.contact_w, leap),
+        contact_w=None if state.contact_w is None else add(state.contact_w, leap),
         position=add(state.position, leap),
         anchor=None if anchor is None else replace(anchor, position_w=add(anchor.position_w, leap)),
         sharing=replace(state.sharing, place=add(state.sharing.place, leap), first=state.sharing.first + leap[2]),

@@ -346,3 +346,20 @@ def test_the_wrench_of_a_hanging_vehicle_is_its_weight_less_what_the_motors_carr
     assert wrench.valid
     assert wrench.force_b[2] == pytest.approx(-0.75 * weight, rel=0.06)
     assert wrench.force_sigma[2] < 0.1 * weight
+
+
+def test_a_bar_of_another_place_is_not_drifted_to_while_the_load_is_taken_back(
+    above: Parameters, wrapped: Facts
+) -> None:
+    far = (2.0, 40.0, -2.2)
+    anchor = dataclasses.replace(ANCHOR, position_w=far)
+    state = memory(Phase.HANG_HOLD, kind=PerchKind.HANG, bend=BENT, contact_w=far, anchor=anchor, rest=far)
+    bar = Bar(Run(state, above), wrapped)
+    bar.order(Order.RELEASE)
+    bar.until(Phase.RELEASE, 30.0)
+    for _ in range(100):
+        bar.cycle()
+    for said in bar.run.said:
+        assert said.setpoint is not None
+        assert math.dist(said.setpoint.position_w, PLACE) < 0.2
+    assert bar.run.state.contact_w is None

@@ -1,0 +1,80 @@
+"""What is remembered of a bar does not outlive the flight, and never sends the vehicle to it from elsewhere."""
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import pytest
+
+from arm_companion.mission.facts import Facts, Order
+from arm_companion.mission.motion import Reference
+from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.state import Phase, State, Vigil
+from arm_companion.mission.vigil import keep_vigil
+from arm_companion.record_codec import dumps, loads
+from tests.unit.mission_rig import ANCHOR, BENT, DT, PLACE, T0, Run, ask, memory, moved, tendon
+
+Hovering = Callable[..., Facts]
+FAR = (2.0, 40.0, -2.2)
+OLD = {"contact_w": FAR, "anchor": dataclasses.replace(ANCHOR, position_w=FAR), "rest": FAR}
+
+
+def forgotten(state: State) -> bool:
+    return state.contact_w is None and state.anchor is None and state.rest is None
+
+
+@pytest.mark.parametrize(
+    ("phase", "order", "after"),
+    [
+        (Phase.STOWED, Order.READY, Phase.READYING),
+        (Phase.READY, Order.STOW, Phase.STOWING),
+        (Phase.STARTUP, None, Phase.STOWED),
+    ],
+)
+def test_a_free_arm_remembers_no_bar(
+    phase: Phase, order: Order | None, after: Phase, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(memory(phase, **OLD), parameters)
+    run.cycle(hovering() if order is None else ask(hovering(), order))
+    assert run.state.phase is after
+    assert forgotten(run.state)
+
+
+def test_an_arm_that_held_nothing_is_let_go_where_the_vehicle_is(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(memory(Phase.STOWED, **OLD), parameters)
+    run.cycles(ask(hovering(), Order.READY), 1.5)
+    stuck = tendon(0, torque=False, error_bits=0x20, ready=False)(hovering())
+    while run.state.phase is not Phase.HOLDING:
+        run.cycles(stuck, 1.0)
+    run.cycle(ask(stuck, Order.RELEASE))
+    assert run.state.phase is Phase.RELEASE
+    run.cycles(stuck, 0.5)
+    setpoint = run.said[-1].setpoint
+    assert setpoint is not None
+    assert setpoint.position_w == PLACE
+
+
+@pytest.mark.parametrize("phase", [Phase.HOLDING, Phase.RELEASE])
+def test_no_set_point_steps_to_a_bar_that_is_elsewhere(
+    phase: Phase, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(memory(phase, **OLD), parameters)
+    run.cycles(ask(hovering(BENT), Order.RELEASE if phase is Phase.HOLDING else Order.FEEDFORWARD, 1.0), 1.0)
+    assert run.state.phase is Phase.RELEASE
+    for said in run.said:
+        assert said.setpoint is not None
+        assert math.dist(said.setpoint.position_w, PLACE) < 1e-9
+
+
+def test_a_place_that_nobody_knows_does_not_become_known_by_a_jump(parameters: Parameters, hovering: Hovering) -> None:
+    state = memory(Phase.HOLDING, contact_w=None, vigil=Vigil(position_w=PLACE))
+    jumped = moved((0.4, 0.0, 0.0))(hovering(BENT))
+    after = keep_vigil(Situation(state, jumped, T0 + DT, parameters))
+    assert after.vigil.leap_m > 0.0
+    assert after.contact_w is None
+
+
+def test_a_place_that_nobody_knows_is_recorded_as_such() -> None:
+    for place in (None, PLACE):
+        state = State(contact_w=place, reference=Reference(PLACE))
+        assert loads(State, dumps(state)).contact_w == place
