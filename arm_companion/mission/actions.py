@@ -272,10 +272,12 @@ def _reference(s: Situation) -> Reference | None:
             return replace(reference, velocity=ZERO)  # nobody knows where the bar was met
         return Reference(beside, ZERO, state.heading)
     goal, speed = _goal(s)
+    # an arm that is wrapped is not turned in by a heading of another place: after a restart nobody knows the bar's
+    keeps = state.phase is Phase.UNLOAD and state.anchor is None
     return follow(
         reference,
         goal,
-        state.heading,
+        reference.yaw if keeps else state.heading,
         speed=speed,
         acceleration=_ACCELERATION,
         yaw_rate=_YAW_RATE,

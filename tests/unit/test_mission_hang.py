@@ -363,3 +363,17 @@ def test_a_bar_of_another_place_is_not_drifted_to_while_the_load_is_taken_back(
         assert said.setpoint is not None
         assert math.dist(said.setpoint.position_w, PLACE) < 0.2
     assert bar.run.state.contact_w is None
+
+
+def test_after_a_restart_the_vehicle_is_not_turned_while_the_arm_is_wrapped(above: Parameters, wrapped: Facts) -> None:
+    yaw = 0.5 * math.pi
+    east = vehicle(attitude_wb=(math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)))(wrapped)
+    run = Run(State(t=T0), above)
+    run.cycles(east, 0.1)
+    run.cycles(ask(east, Order.READY), 0.1)
+    run.cycle(ask(east, Order.RELEASE))
+    x, y, z = PLACE
+    for i in range(400):
+        run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(east))
+    assert {Phase.UNLOAD, Phase.RELEASE} <= set(run.phases)
+    assert all(said.setpoint.yaw == pytest.approx(yaw) for said in run.said if said.setpoint is not None)
