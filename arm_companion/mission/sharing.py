@@ -81,11 +81,18 @@ def keep_sharing(s: Situation) -> Sharing:
 
 
 def _motors_carry(s: Situation) -> bool:
-    """Whether the motors carry the vehicle: by their throttle, else because it has risen off the arm."""
+    """Whether the motors carry the vehicle: by their throttle, else because it has risen off the arm.
+
+    A height drifts by as much, so nothing has risen with motors that idle, nor in the hands of a pilot whose throttle
+    is not told.
+    """
     if s.state.sharing.share < 1.0 or not s.facts.vehicle.armed or s.facts.vehicle.landed:
         return False
     share = motor_share(s)
-    return -sunk(s) >= _ROSE_M if share is None else share >= s.config.hang.carried_share
+    if share is not None:
+        return share >= s.config.hang.carried_share
+    lifts = s.facts.vehicle.throttle >= _LEAST_THROTTLE if throttle_known(s) else s.external
+    return lifts and -sunk(s) >= _ROSE_M
 
 
 def carried(s: Situation) -> bool:

@@ -377,3 +377,27 @@ def test_after_a_restart_the_vehicle_is_not_turned_while_the_arm_is_wrapped(abov
         run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(east))
     assert {Phase.UNLOAD, Phase.RELEASE} <= set(run.phases)
     assert all(said.setpoint.yaw == pytest.approx(yaw) for said in run.said if said.setpoint is not None)
+
+
+@pytest.mark.parametrize(
+    ("control", "fields", "opens"),
+    [
+        (Control.PILOT, {"throttle": 0.05}, False),
+        (Control.PILOT, {"throttle": 0.4}, True),
+        (Control.PILOT, {"throttle_age_s": 9.0}, False),
+        (Control.EXTERNAL, {"throttle": 0.05}, False),
+        (Control.EXTERNAL, {"throttle_age_s": 9.0}, True),
+    ],
+)
+def test_a_height_that_drifts_opens_no_arm_over_idle_motors(
+    control: Control, fields: dict[str, object], opens: bool, above: Parameters, wrapped: Facts
+) -> None:
+    flown = vehicle(control=control, mode="STABILIZED", **fields)(wrapped)
+    run = Run(State(t=T0), above)
+    run.cycles(ask(flown, Order.READY), 0.1)
+    run.cycles(ask(flown, Order.READY), 0.1)
+    run.cycle(ask(flown, Order.RELEASE))
+    x, y, z = PLACE
+    for i in range(400):
+        run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(flown))
+    assert (Phase.UNLOAD in run.phases) is opens
