@@ -37,7 +37,7 @@ from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import DeviceFault
 from arm_companion.live.feed import Address
-from arm_companion.mission.facts import ArmAction, Bar, Commands, Facts, Notice, Severity
+from arm_companion.mission.facts import ArmAction, Bar, Commands, Control, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
@@ -360,8 +360,12 @@ class Daemon:
             if SAFE_ACTION[self._state.phase] is ArmAction.LIMP:
                 await self._recalibration.let_go()
             if last is not None and last.setpoint is not None:
-                still = dataclasses.replace(last.setpoint, velocity_w=(0.0, 0.0, 0.0))
-                self._autopilot.send(still, tick.now)
+                vehicle = self._autopilot.state(tick.now)
+                if vehicle.armed and vehicle.control is Control.EXTERNAL:
+                    still = dataclasses.replace(last.setpoint, velocity_w=(0.0, 0.0, 0.0))
+                    self._autopilot.send(still, tick.now)
+                else:  # for good: who takes the vehicle and gives it back has flown it elsewhere
+                    self._last = dataclasses.replace(last, setpoint=None)
             if self.failures == 1 or self.failures % 100 == 0:
                 text = f"cycle failed {self.failures} times; arm and vehicle hold"
                 self._component.notify(Notice(Severity.CRITICAL, text))
