@@ -96,9 +96,11 @@ def _prepare(s: Situation) -> State:
         case Phase.HOLDING | Phase.STOWED:
             return replace(_of_this_bar(s), bend=s.bend, bend_goal=s.bend, pulls=(), course=None)
         case Phase.APPROACH:
+            heading = s.heading_to_bar()  # and the bar's place: the way back is from this one, whatever is told then
             return replace(
                 state,
-                heading=s.heading_to_bar(),
+                heading=heading,
+                contact_w=s.remembering(replace(state, heading=heading)).place(0.0),
                 anchor=None,
                 rest=None,
                 offset=ZERO,
@@ -106,7 +108,8 @@ def _prepare(s: Situation) -> State:
                 tries=state.tries + 1,
             )
         case Phase.REACH:
-            return replace(state, force=replace(state.force, tared_s=0.0, above_s=0.0))
+            force = replace(state.force, tared_s=0.0, above_s=0.0)
+            return replace(state, force=force, contact_w=s.place(0.0))
         case Phase.CONTACT:
             return replace(state, contact_w=_touching(s))
         case Phase.WRAP | Phase.CLOSE:

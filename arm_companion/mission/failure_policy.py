@@ -158,6 +158,12 @@ CAUSES: tuple[Cause, ...] = (
         "not judged: the vehicle is not asked to stay, or not held yet",
     ),
     Cause("no contact in time", ArmFault.NO_CONTACT, (perch.no_contact,), "does not apply"),
+    Cause(
+        "bar or object told elsewhere",
+        ArmFault.NO_CONTACT,
+        (perch.told_elsewhere,),
+        "nothing: the way back is from the one that was met",
+    ),
     Cause("nothing below to set a load down on", ArmFault.NO_CONTACT, (grasp.nothing_below,), "does not apply"),
     Cause(
         "gripper does not open",

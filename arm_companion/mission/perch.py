@@ -26,7 +26,7 @@ from arm_companion.mission.hazards import (
     wrench_over_limit,
 )
 from arm_companion.mission.machine import OrderRow, Table, Transition
-from arm_companion.mission.motion import ZERO, arrived, norm
+from arm_companion.mission.motion import ZERO, arrived, norm, sub
 from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, tested_to_hang
 from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
@@ -51,6 +51,7 @@ _AT_BAR_M = 0.03
 _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
 _CLEAR_BEND_RAD = 0.25
+_SAME_M = 0.5  # a bar that is told anew, and better, is as near
 _READYING_S = 10.0
 
 
@@ -76,6 +77,14 @@ def no_contact(s: Situation) -> str | None:
     if reference is not None and arrived(reference, end) and at(s, end, 0.05):
         return f"no contact {perch.overreach_m * 100:.0f} cm past where the bar should be"
     return None
+
+
+def told_elsewhere(s: Situation) -> str | None:
+    """The bar or object is told to be far from where it was when the vehicle set out: nobody has checked this one."""
+    before = s.state.contact_w
+    if before is None or (away := norm(sub(s.place(0.0), before))) <= _SAME_M:
+        return None
+    return f"the {'object' if s.grasping else 'bar'} is told {away:.1f} m from where it was"
 
 
 def no_grip(s: Situation) -> str | None:
@@ -297,6 +306,7 @@ TABLE: Table[Phase, Situation] = Table(
         ),
         Row(GRASPING | {Phase.VERIFY}, estimator_jumped, Phase.UNLOAD, "estimator jump", ArmFault.ESTIMATOR_JUMP),
         Row(FREE_FLIGHT | {Phase.DEPART}, astray, Phase.STOWING, "set-points not followed", ArmFault.SETPOINT_REJECTED),
+        Row(FREE_FLIGHT, told_elsewhere, Phase.DEPART, "bar told elsewhere", ArmFault.NO_CONTACT),
         # then the arm: nothing new is begun with it, and a grip that is tested already stays until a person says
         *(
             Row(phases, guard, target, name, error)

@@ -285,9 +285,11 @@ class Situation:
 
     @property
     def standoff(self) -> Vec3:
-        """Vehicle position at the stand-off: before the target, or before the place where an object was let go."""
+        """Vehicle position at the stand-off: before the target, or on the way back before the place of the one met."""
         distance = self.config.perch.standoff_m
-        if self.grasping and self.state.phase is Phase.DEPART:
+        if self.state.phase is Phase.DEPART:
+            if self.state.contact_w is None:
+                return self.contact_w
             return sub(self.contact_w, scale(self.straight_w if self.gripping else self.ahead, distance))
         return self.place(distance)
 

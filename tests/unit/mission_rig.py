@@ -23,6 +23,8 @@ from arm_companion.values import replace
 DT = 0.01
 T0 = 100.0
 PLACE = (2.0, 0.0, -2.2)
+MET = (2.942, 0.0, -2.18)
+"""Where the arm touches the configured bar."""
 ANCHOR = Anchor(PLACE, (1.0, 0.0, 0.0, 0.0), (8.0, 4.0, 1.0, 4.0))
 BENT = (3.0, 0.0)
 HUNG = Sharing(hover=0.5, share=0.25, step=0.25, place=PLACE, first=PLACE[2])
@@ -50,7 +52,7 @@ def memory(phase: Phase, **fields: object) -> State:
         "streaming": phase is not Phase.STARTUP,
         "reference": Reference(PLACE),
         "position": PLACE,
-        "contact_w": PLACE,
+        "contact_w": MET if phase in {Phase.APPROACH, Phase.REACH, Phase.DEPART} else PLACE,
         "anchor": ANCHOR if held else None,
         "sharing": HUNG if phase in SUSPENDED else Sharing(),
         "reach": REACH if phase in TIP else None,

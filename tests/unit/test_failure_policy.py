@@ -198,6 +198,9 @@ PROVOCATIONS: dict[str, Provocation] = {
     "nothing below to set a load down on": Provocation("nothing found", moved((0.0, 0.0, DEEP)), _at_the_bottom),
     "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
+    "bar or object told elsewhere": Provocation(
+        "is told", lambda f: dataclasses.replace(f, bar=Bar((9.0, 0.0, -2.0), (0.0, 1.0, 0.0), 0.035), bar_age_s=0.0)
+    ),
     "gripper does not open": Provocation(
         "gripper did not open",
         jaws(closed=0.6),

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import pytest
 
-from arm_companion.mission.facts import Facts, Order
+from arm_companion.mission.facts import Bar, Facts, Order
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, State, Vigil
 from arm_companion.mission.vigil import keep_vigil
 from arm_companion.record_codec import dumps, loads
-from tests.unit.mission_rig import ANCHOR, BENT, DT, PLACE, T0, Run, ask, memory, moved, tendon
+from tests.unit.mission_rig import ANCHOR, BENT, DT, MET, PLACE, T0, Run, ask, memory, moved, tendon, vehicle
 
 Hovering = Callable[..., Facts]
 FAR = (2.0, 40.0, -2.2)
@@ -78,3 +78,30 @@ def test_a_place_that_nobody_knows_is_recorded_as_such() -> None:
     for place in (None, PLACE):
         state = State(contact_w=place, reference=Reference(PLACE))
         assert loads(State, dumps(state)).contact_w == place
+
+
+NEW = Bar((9.0, 0.0, -2.0), (0.0, 1.0, 0.0), 0.035)
+
+
+def test_a_bar_that_is_told_anew_does_not_redirect_a_departure(parameters: Parameters, hovering: Hovering) -> None:
+    facts = dataclasses.replace(hovering(), bar=NEW, bar_age_s=0.1)
+    run = Run(memory(Phase.DEPART, reference=Reference(MET), position=MET), parameters)
+    for _ in range(500):
+        reference = run.state.reference
+        assert reference is not None
+        run.cycle(vehicle(position_w=reference.position)(facts))
+    x, y, z = MET
+    assert run.phases == [Phase.DEPART, Phase.STOWING, Phase.STOWED]
+    assert run.state.reference is not None
+    assert run.state.reference.position == pytest.approx((x - parameters.config.perch.standoff_m, y, z), abs=1e-6)
+
+
+@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.REACH])
+@pytest.mark.parametrize(("off", "ends"), [(0.4, False), (0.6, True)])
+def test_a_bar_that_is_told_elsewhere_ends_the_way_there(
+    off: float, ends: bool, phase: Phase, parameters: Parameters, hovering: Hovering
+) -> None:
+    bar = dataclasses.replace(NEW, point_w=(3.0 + off, 0.0, -2.0))
+    run = Run(memory(phase), parameters)
+    run.cycles(dataclasses.replace(hovering(), bar=bar, bar_age_s=0.1), 0.1)
+    assert run.phases == ([phase, Phase.DEPART] if ends else [phase])
