@@ -17,9 +17,9 @@ from arm_companion.arm import arc, reach
 from arm_companion.errors import CommandRejected
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
-from arm_companion.mission.facts import Request, Vec3
+from arm_companion.mission.facts import Control, Request, Vec3
 from arm_companion.mission.glide import Glide, glide, there
-from arm_companion.mission.motion import ZERO, Reference, add, norm, scale, sub, yaw_of
+from arm_companion.mission.motion import ZERO, Reference, add, norm, scale, sub, wrap_angle, yaw_of
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import TIP, Phase, Reach, State
 from arm_companion.values import replace
@@ -33,6 +33,9 @@ _HERE_S = 0.3  # the velocity tells what is faster than that, the position what 
 _AHEAD_S = 0.08  # until a bend that is asked for is there
 _SAG_S = 0.3
 _ERROR_S = 0.2
+_UNKNOWN_S = 0.5  # without a solution of the mechanics, after which nobody knows where the tip is
+_BESIDE_M = 0.1  # as far as a pilot's hover is from where the vehicle was at the order
+_BESIDE_RAD = 0.1
 _SOLVER_STEPS = 3
 _STOP_S = 0.02  # of the way on: a reference that moves in steps brakes a little later
 _TO_PLAN = 1e-3  # weight of the plan's bend against the tip's place, each in lengths of the arm
@@ -133,12 +136,29 @@ def move(s: Situation) -> State:
     state, goal = s.state, s.state.reach
     if goal is None or not s.vehicle_fresh or s.dt <= 0.0:
         return _still(s)
+    if s.external and state.control is not Control.EXTERNAL:
+        s = s.remembering(_given_back(s, goal))
+        state, goal = s.state, s.state.reach or goal
     goal = _glide_on(s, _observe(s, goal))
     state = replace(state, reach=goal, bend_goal=_bend(s, goal))
     if not (s.external and s.wants_stream):
         return replace(_still(s.remembering(state)), reference=_here(s))
     reference = Reference(goal.vehicle.position, goal.vehicle.velocity, state.heading)
     return replace(state, reference=reference, lean=goal.vehicle.acceleration)
+
+
+def _given_back(s: Situation, goal: Reach) -> State:
+    """Memory in the cycle in which a vehicle that a pilot flew becomes ours: set-points begin where it is.
+
+    From beside the plan's place it glides there. Anywhere else it stays, and the tip does what it can.
+    """
+    vehicle = s.facts.vehicle
+    yaw = yaw_of(vehicle.attitude_wb)
+    near = norm(sub(vehicle.position_w, goal.vehicle_w)) <= _BESIDE_M
+    here = replace(goal, vehicle=Glide.rest(vehicle.position_w), here_w=vehicle.position_w)
+    if near and abs(wrap_angle(yaw - s.state.heading)) <= _BESIDE_RAD:
+        return replace(s.state, reach=here)
+    return replace(s.state, heading=yaw, reach=replace(here, vehicle_w=vehicle.position_w))
 
 
 def _still(s: Situation) -> State:
@@ -172,17 +192,20 @@ def _observe(s: Situation, goal: Reach) -> Reach:
     here = add(goal.here_w, scale(vehicle.velocity_w, dt))
     measured = add(vehicle.position_w, scale(vehicle.velocity_w, vehicle.position_age_s))
     here = add(here, scale(sub(measured, here), dt / (_HERE_S + dt)))
-    sag, error = goal.sag_a, goal.error_m
+    sag, error, unknown = goal.sag_a, goal.error_m, goal.unknown_s + dt
     if prediction is not None and math.isfinite(prediction.tip_a[0]):
         length = s.parameters.model.parameters.L
         now = sub(prediction.tip_a, _vec3(arc.tip_position(prediction.bend, length)))
         sag = add(sag, scale(sub(now, sag), dt / (_SAG_S + dt)))
         tip_a = arc.tip_position(s.bend, length) + sag
         tip = here + so3.from_quaternion(vehicle.attitude_wb) @ (s.mount.position + s.mount.rotation @ tip_a)
-        away = math.dist(tip, goal.target_w)
+        away, unknown = math.dist(tip, goal.target_w), 0.0
         error = away if math.isinf(error) else error + dt / (_ERROR_S + dt) * (away - error)
-    within = goal.within_s + dt if error <= s.config.reach.tolerance_m and settled(goal) else 0.0
-    return replace(goal, here_w=here, sag_a=sag, error_m=error, within_s=within)
+    if unknown > _UNKNOWN_S:
+        error = math.inf
+    there_now = not unknown and error <= s.config.reach.tolerance_m and settled(goal)
+    within = goal.within_s + dt if there_now else 0.0
+    return replace(goal, here_w=here, sag_a=sag, error_m=error, within_s=within, unknown_s=unknown)
 
 
 def settled(goal: Reach) -> bool:

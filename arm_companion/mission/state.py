@@ -215,6 +215,7 @@ class Reach:
         sag_a: from the arc's tip to the real one's, base axes, m.
         error_m: distance of tip and target, by position, attitude and the mechanics.
         within_s: for how long the tip has been at its point.
+        unknown_s: for how long the mechanics have not told where it is.
     """
 
     target_w: Vec3
@@ -228,6 +229,7 @@ class Reach:
     sag_a: Vec3 = ZERO
     error_m: float = math.inf
     within_s: float = 0.0
+    unknown_s: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ import pytest
 from arm_companion.arm import arc, statics
 from arm_companion.geometry import so3
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result, Setpoint
-from arm_companion.mission.motion import Reference, norm, sub
-from arm_companion.mission.reaching import bend_limit
+from arm_companion.mission.motion import Reference, add, norm, sub
+from arm_companion.mission.reaching import bend_limit, move
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, State, Vigil
 from arm_companion.record_codec import dumps, loads
@@ -369,3 +369,46 @@ def test_the_correction_never_bends_into_the_keep_out_cone(parameters: Parameter
     for off in np.linspace(0.0, 0.2, 20):
         run.cycles(hovering((4.0, 0.0), position_w=(PLACE[0] + float(off), PLACE[1], PLACE[2] + float(off))), 0.2)
         assert keep_out.clearance(np.asarray(run.state.bend)) >= 0.0
+
+
+@pytest.mark.parametrize(("flown", "yaw"), [((0.0, 0.0, 0.0), 1.0), ((0.0, 8.0, 0.0), 0.0), ((0.05, 0.0, 0.0), 0.0)])
+def test_a_vehicle_that_becomes_ours_is_asked_to_be_where_it_is(
+    flown: Vec3, yaw: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    pilot = {"control": Control.PILOT, "mode": "POSCTL"}
+    run = Run(memory(Phase.TIP_HOLD, control=Control.PILOT), parameters)
+    run.cycles(hovering(**pilot), 0.2)
+    there = add(PLACE, flown)
+    moved = hovering(position_w=there, attitude_wb=(math.cos(0.5 * yaw), 0.0, 0.0, math.sin(0.5 * yaw)))
+    run.state = dataclasses.replace(run.state, vigil=Vigil())  # flown, and no jump
+    run.cycles(vehicle(**pilot)(moved), 0.2)
+    run.cycle(moved)
+    first = run.said[-1].setpoint
+    assert first is not None
+    assert math.dist(first.position_w, there) < 1e-3
+    assert first.yaw == pytest.approx(yaw)
+    run.cycles(moved, 2.0)
+    last = run.said[-1].setpoint
+    assert last is not None
+    near = norm(flown) < 0.1 and yaw == 0.0
+    assert math.dist(last.position_w, PLACE if near else there) < 2e-3
+
+
+def test_a_tip_that_the_mechanics_lose_is_not_at_its_point(parameters: Parameters, hovering: Hovering) -> None:
+    run = Run(memory(Phase.TIP_MOVE), parameters)
+    reach, nowhere = run.state.reach, (math.nan, math.nan, math.nan)
+    run.cycles(hovering(), 0.05)
+    known = run.state
+    assert reach is not None
+    assert known.prediction is not None
+    lost = dataclasses.replace(
+        known,
+        prediction=dataclasses.replace(known.prediction, tip_a=nowhere),
+    )
+    for unknown, told in ((0.0, 1e-3), (0.6, math.inf)):
+        state = dataclasses.replace(
+            lost, reach=dataclasses.replace(reach, error_m=1e-3, within_s=0.3, unknown_s=unknown)
+        )
+        after = move(Situation(state, hovering(), state.t + 0.01, parameters)).reach
+        assert after is not None
+        assert (after.within_s, after.error_m) == (0.0, told)
