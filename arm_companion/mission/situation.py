@@ -14,7 +14,7 @@ from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Order, TendonState, Vec3
 from arm_companion.mission.gripper_facts import JawState
-from arm_companion.mission.motion import ZERO, add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
+from arm_companion.mission.motion import add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.values import replace
 
@@ -257,10 +257,11 @@ class Situation:
 
     def _after_jumps(self, bar: Bar, age: float) -> Bar:
         """A target told `age` seconds ago, moved with what the estimator has jumped since."""
-        vigil = self.state.vigil
-        if vigil.shift == ZERO or self.t - age > vigil.jumped_at:  # nothing jumped since it was told
-            return bar
-        return replace(bar, point_w=add(bar.point_w, vigil.shift))
+        point = bar.point_w
+        for at, leap in self.state.vigil.jumps:
+            if self.t - age <= at:
+                point = add(point, leap)
+        return bar if point is bar.point_w else replace(bar, point_w=point)
 
     def base_offset_w(self, yaw: float) -> Vec3:
         """From the vehicle's centre of mass to the arm's base while it hovers at `yaw`, world axes."""

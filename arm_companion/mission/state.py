@@ -147,7 +147,7 @@ class Vigil:
         slack_s: a tendon is surely under its least tension.
         tight_s: a tendon reads more than its greatest tension.
         blind_s: the mechanics have no solution.
-        shift: sum of the jumps of the estimator, m.
+        jumps: of the estimator, loop time and way, m: what is told after one is in its frame.
         jumped_at: loop time of the last jump.
         leap_m: its size.
     """
@@ -160,7 +160,7 @@ class Vigil:
     slack_s: float = 0.0
     tight_s: float = 0.0
     blind_s: float = 0.0
-    shift: Vec3 = ZERO
+    jumps: tuple[tuple[float, Vec3], ...] = ()
     jumped_at: float = 0.0
     leap_m: float = 0.0
 

@@ -16,6 +16,8 @@ VOLTAGE_MARGIN_V = 0.5
 """The supply is called low by so much before a servo reports it."""
 
 _JUMP_M = 0.25  # more than the estimator's noise, less than what hurts at a bar
+_JUMPS = 8  # that are remembered one by one
+_AWAY_S = 3.0
 _ASTRAY_M = 0.5  # the reference moves at half a metre a second, and a multirotor lags it by less than a second
 
 
@@ -34,6 +36,8 @@ def keep_vigil(s: Situation) -> State:
         return before + dt if holds else 0.0
 
     before = state.vigil
+    if _new_frame(s):
+        before = replace(before, jumps=())
     vigil = replace(
         before,
         position_w=s.facts.vehicle.position_w if s.vehicle_fresh else None,
@@ -51,6 +55,12 @@ def keep_vigil(s: Situation) -> State:
         blind_s=time(before.blind_s, holds=_blind(s)),
     )
     return replace(state, vigil=vigil)
+
+
+def _new_frame(s: Situation) -> bool:
+    """Whether the autopilot has been away on the ground, restarted perhaps: its new frame has not jumped yet."""
+    vehicle = s.facts.vehicle
+    return not vehicle.armed and max(vehicle.position_age_s, vehicle.heartbeat_age_s) > _AWAY_S
 
 
 def _astray(s: Situation) -> bool:
@@ -90,8 +100,10 @@ def _move_frame(s: Situation, leap: Vec3) -> State:
     """
     state = s.state
     anchor, reference = state.anchor, state.reference
-    told_since = s.t - s.facts.bar_age_s > state.vigil.jumped_at  # the bar, in the frame after the last jump
-    shift = leap if told_since else add(state.vigil.shift, leap)
+    jumps = (*state.vigil.jumps, (s.t, leap))
+    if len(jumps) > _JUMPS:  # the two oldest are one: few targets are older than one of them and not the other
+        (_, first), (at, second), *rest = jumps
+        jumps = ((at, add(first, second)), *rest)
     return replace(
         state,
         reference=None if reference is None else replace(reference, position=add(reference.position, leap)),
@@ -100,5 +112,5 @@ def _move_frame(s: Situation, leap: Vec3) -> State:
         anchor=None if anchor is None else replace(anchor, position_w=add(anchor.position_w, leap)),
         sharing=replace(state.sharing, place=add(state.sharing.place, leap), first=state.sharing.first + leap[2]),
         rest=None if state.rest is None else add(state.rest, leap),
-        vigil=replace(state.vigil, shift=shift, jumped_at=s.t, leap_m=norm(leap)),
+        vigil=replace(state.vigil, jumps=jumps, jumped_at=s.t, leap_m=norm(leap)),
     )

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from arm_companion.mission.facts import Control, Facts, WrenchReport, WrenchSource
+from arm_companion.mission.facts import Bar, Control, Facts, GraspTarget, WrenchReport, WrenchSource
 from arm_companion.mission.motion import Reference, add
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Sharing, State, Vigil
@@ -141,17 +141,54 @@ def test_everything_in_world_axes_moves_with_a_jump(parameters: Parameters, hove
     assert after.sharing.place == pytest.approx(add((1.0, 2.0, -7.0), LEAP))
     assert after.sharing.first == pytest.approx(-8.0 + LEAP[2])
     assert after.anchor.position_w == pytest.approx(add(ANCHOR.position_w, LEAP))
-    assert after.vigil.shift == pytest.approx(LEAP)
+    ((at, leap),) = after.vigil.jumps
+    assert at == T0 + DT
+    assert leap == pytest.approx(LEAP)
     assert after.vigil.leap_m == pytest.approx(math.hypot(*LEAP))
     assert after.vigil.jumped_at == T0 + DT
 
 
-def test_jumps_add_up_until_the_bar_is_told_in_the_new_frame(parameters: Parameters, hovering: Hovering) -> None:
-    state = memory(Phase.READY, vigil=Vigil(position_w=PLACE, shift=(5.0, 0.0, 0.0), jumped_at=T0 - 10.0))
+def test_a_target_moves_with_the_jumps_since_it_was_told(parameters: Parameters, hovering: Hovering) -> None:
+    first = (5.0, 0.0, 0.0)
+    state = memory(Phase.READY, vigil=Vigil(position_w=PLACE, jumps=((T0 - 10.0, first),), jumped_at=T0 - 10.0))
     jumped = moved(LEAP)(hovering())
-    before, since = (dataclasses.replace(jumped, bar_age_s=age) for age in (60.0, 5.0))
-    assert kept(state, before, parameters).vigil.shift == pytest.approx(add((5.0, 0.0, 0.0), LEAP))
-    assert kept(state, since, parameters).vigil.shift == pytest.approx(LEAP)
+    after = kept(state, jumped, parameters)
+    told = GraspTarget((1.0, 0.0, -1.0), None, 0.03)
+    for age, leaps in ((60.0, (first, LEAP)), (5.0, (LEAP,)), (0.0, ())):
+        facts = dataclasses.replace(
+            jumped, bar=Bar((1.0, 0.0, -1.0), (0.0, 1.0, 0.0), 0.03), bar_age_s=age, grasp_target=told
+        )
+        facts = dataclasses.replace(facts, grasp_target_age_s=age)
+        there: tuple[float, float, float] = (1.0, 0.0, -1.0)
+        for leap in leaps:
+            there = add(there, leap)
+        seen = Situation(after, facts, T0 + 2.0 * DT, parameters)
+        assert seen.perch_bar.point_w == pytest.approx(there)
+        assert seen.object.point_w == pytest.approx(there)
+
+
+def test_jumps_are_few_in_memory_and_none_is_lost(parameters: Parameters, hovering: Hovering) -> None:
+    many = tuple((T0 - 20.0 + i, (1.0, 0.0, 0.0)) for i in range(8))
+    state = memory(Phase.READY, vigil=Vigil(position_w=PLACE, jumps=many))
+    jumps = kept(state, moved(LEAP)(hovering()), parameters).vigil.jumps
+    assert len(jumps) == 8
+    assert jumps[0] == (T0 - 19.0, (2.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("fields", "left"),
+    [
+        ({"armed": False, "position_age_s": 5.0}, 0),
+        ({"armed": False, "heartbeat_age_s": 5.0}, 0),
+        ({"armed": True, "heartbeat_age_s": 5.0}, 1),
+        ({"armed": False}, 1),
+    ],
+)
+def test_an_autopilot_that_was_away_on_the_ground_has_a_new_frame(
+    fields: dict[str, object], left: int, parameters: Parameters, hovering: Hovering
+) -> None:
+    state = memory(Phase.STOWED, vigil=Vigil(jumps=((T0 - 10.0, LEAP),)))
+    assert len(kept(state, vehicle(**fields)(hovering()), parameters).vigil.jumps) == left
 
 
 def test_what_the_vehicle_can_have_flown_is_no_jump(parameters: Parameters, hovering: Hovering) -> None:
