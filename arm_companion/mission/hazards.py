@@ -13,6 +13,7 @@ _SLIP_M = 0.12
 _ASTRAY_S = 1.0
 _DOUBTFUL_S = 1.0
 _BLIND_S = 0.5
+_UNHEARD_S = 5.0  # longer than servos take to be set up
 _GROUND_LOST_S = 5.0
 _TIGHT_S = 0.1
 _FAR_OVER = 1.15  # times the limit; a reading's noise is a twelfth of it, one sigma
@@ -60,6 +61,13 @@ def vehicle_lost(s: Situation) -> str | None:
 def servo_fault(s: Situation) -> str | None:
     """A servo is silent, reports a hardware error, or no longer knows its turns."""
     return s.servo_fault
+
+
+def unheard_at_start(s: Situation) -> str | None:
+    """What the arm does now is not known, because a servo stays silent that the daemon waits for at its start."""
+    if s.state.vigil.unheard_s <= _UNHEARD_S:
+        return None
+    return s.servo_fault or "the autopilot, which moves the gripper, is not heard"
 
 
 def tendon_broken(s: Situation) -> str | None:

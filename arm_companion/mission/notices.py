@@ -18,6 +18,7 @@ from arm_companion.mission.hazards import (
     slack,
     tendon_broken,
     tendon_jumped,
+    unheard_at_start,
     vehicle_lost,
     wrench_over_limit,
 )
@@ -31,6 +32,12 @@ from arm_companion.mission.state import CALIBRATES, CARRYING, MOVES_VEHICLE, TIP
 Told = Warned[Phase, Situation]
 
 WARNINGS: tuple[Told, ...] = (
+    Told(
+        frozenset({Phase.STARTUP}),
+        unheard_at_start,
+        Severity.CRITICAL,
+        "the arm is left as it is, and nothing is possible before it is heard",
+    ),
     Told(TENSE, servo_fault, Severity.CRITICAL, "the arm holds"),
     *(
         Told(GRIPPED | CARRYING | {Phase.HOLDING}, guard, Severity.CRITICAL, "the arm holds")

@@ -18,6 +18,8 @@ def cannot_set_out(s: Situation, target: Bar, name: str, *, wraps: bool = True) 
         return "the vehicle is not flying"
     if not s.external:
         return f"the autopilot is in {vehicle.mode or 'an unknown mode'}: switch it to external set-points first"
+    if not s.state.streaming:
+        return "the pilot had the vehicle: order READY first"
     if (distance := norm(sub(target.point_w, vehicle.position_w))) > _WITHIN_M:
         return f"the {name} is {distance:.0f} m away; at most {_WITHIN_M:g} m are allowed"
     if abs(target.axis_w[2]) > _LEVEL:

@@ -147,6 +147,7 @@ class Vigil:
         slack_s: a tendon is surely under its least tension.
         tight_s: a tendon reads more than its greatest tension.
         blind_s: the mechanics have no solution.
+        unheard_s: a servo has not been heard.
         jumps: of the estimator, loop time and way, m: what is told after one is in its frame.
         jumped_at: loop time of the last jump.
         leap_m: its size.
@@ -160,6 +161,7 @@ class Vigil:
     slack_s: float = 0.0
     tight_s: float = 0.0
     blind_s: float = 0.0
+    unheard_s: float = 0.0
     jumps: tuple[tuple[float, Vec3], ...] = ()
     jumped_at: float = 0.0
     leap_m: float = 0.0

@@ -53,6 +53,7 @@ def keep_vigil(s: Situation) -> State:
         ),
         tight_s=time(before.tight_s, holds=any(t.tension > limits.tension_max_n for t in heard)),
         blind_s=time(before.blind_s, holds=_blind(s)),
+        unheard_s=time(before.unheard_s, holds=not s.heard),
     )
     return replace(state, vigil=vigil)
 

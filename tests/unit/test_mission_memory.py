@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from arm_companion.mission.facts import Bar, Facts, Order
+from arm_companion.mission.facts import ArmFault, Bar, Facts, Order, Result, Severity
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, State, Vigil
@@ -105,3 +105,27 @@ def test_a_bar_that_is_told_elsewhere_ends_the_way_there(
     run = Run(memory(phase), parameters)
     run.cycles(dataclasses.replace(hovering(), bar=bar, bar_age_s=0.1), 0.1)
     assert run.phases == ([phase, Phase.DEPART] if ends else [phase])
+
+
+@pytest.mark.parametrize("order", [Order.PERCH, Order.GRASP])
+def test_nobody_sets_out_before_set_points_go_out_again(
+    order: Order, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(memory(Phase.READY, streaming=False, reference=None), parameters)
+    answer = run.cycle(ask(hovering(), order)).answers[0]
+    assert (answer.result, answer.reason) == (
+        Result.TEMPORARILY_REJECTED,
+        "the pilot had the vehicle: order READY first",
+    )
+
+
+def test_a_start_that_waits_for_a_servo_says_for_which(parameters: Parameters, hovering: Hovering) -> None:
+    dead = tendon(2, silent=True, age_s=math.inf)(hovering(BENT))
+    run = Run(State(t=T0 - DT), parameters)
+    run.cycles(dead, 4.0)
+    assert not run.texts
+    run.cycles(dead, 10.0)
+    (notice,) = [notice for said in run.said for notice in said.notices]
+    assert notice.severity is Severity.CRITICAL
+    assert notice.text.startswith("tendon 3: servo does not answer; the arm is left as it is")
+    assert run.said[-1].status.error_bits & ArmFault.SERVO_SILENT
