@@ -106,6 +106,11 @@ class ThrustCurve:
         return self.covariance[0][0] <= _CALIBRATED**2
 
     @property
+    def gain_sigma(self) -> float:
+        """One sigma of `gain`, which its slope is almost all of."""
+        return math.sqrt(self.covariance[1][1]) * self.at / GRAVITY
+
+    @property
     def gain(self) -> float:
         """Acceleration that comes of one that is asked for, by an autopilot that takes thrust for proportional.
 

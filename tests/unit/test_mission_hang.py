@@ -12,6 +12,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import load
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
+from arm_companion.mission.payload import ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import PerchKind, Phase, Sharing, State
@@ -401,3 +402,36 @@ def test_a_height_that_drifts_opens_no_arm_over_idle_motors(
     for i in range(400):
         run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(flown))
     assert (Phase.UNLOAD in run.phases) is opens
+
+
+@pytest.mark.parametrize("bent", [0.0, 0.25, 0.4])
+def test_the_thrust_of_idling_motors_is_that_of_the_curve_that_they_flew_with(
+    above: Parameters, hanging: Bar, bent: float
+) -> None:
+    """Rotors whose thrust is (1 - c) x + c x^2 lift less at a quarter of their throttle than a quarter."""
+    bar, prior = hanging, ThrustCurve.prior(HOVER_THROTTLE)
+    slope = (1.0 + bent) * GRAVITY / HOVER_THROTTLE
+    curve = dataclasses.replace(
+        prior,
+        theta=(prior.theta[0], slope, *prior.theta[2:]),
+        covariance=(prior.covariance[0], (0.0, (0.1 * slope) ** 2, 0.0, 0.0), *prior.covariance[2:]),
+    )
+    for _ in range(50):
+        bar.run.state = dataclasses.replace(bar.run.state, load=dataclasses.replace(bar.run.state.load, curve=curve))
+        bar.cycle()
+    wrench, mass = bar.run.said[-1].wrench, above.config.vehicle.mass_kg
+    x = bar.throttle / HOVER_THROTTLE
+    carried = (mass - above.model.parameters.mass - mass * ((1.0 - bent) * x + bent * x * x)) * GRAVITY
+    assert wrench.force_b[2] == pytest.approx(-carried, abs=0.02)
+    assert 0.03 * mass * GRAVITY < wrench.force_sigma[2] < 0.06 * mass * GRAVITY
+
+
+def test_what_idling_motors_twist_while_they_level_is_within_what_is_told(above: Parameters, hanging: Bar) -> None:
+    """In the plant they ended with all that they had, 2.7 N at 0.18 m, on one side."""
+    for _ in range(50):
+        hanging.cycle()
+    weight = above.config.vehicle.mass_kg * GRAVITY
+    pitch = 0.18 * hanging.throttle / HOVER_THROTTLE * weight
+    wrench = hanging.run.said[-1].wrench
+    assert wrench.torque_b == (0.0, 0.0, 0.0)
+    assert min(wrench.torque_sigma[:2]) > 0.8 * pitch
