@@ -159,8 +159,16 @@ class ThrustCurve:
 
     def forget(self, dt: float) -> "ThrustCurve":
         """The curve after `dt` seconds with rotors that idle, or whose thrust is not told."""
-        first, *rest = self.covariance
-        return replace(self, covariance=((first[0] + _DRIFT**2 * dt, *first[1:]), rest[0], rest[1], rest[2]))
+        P = np.array(self.covariance)
+        P[0, 0] += _DRIFT**2 * dt
+        return replace(self, covariance=_rows(P))
+
+    def unplugged(self) -> "ThrustCurve":
+        """The curve of a vehicle that stood disarmed, which is when people swap batteries: the rotors stay the same."""
+        P = np.array(self.covariance)
+        for i in (0, 3):
+            P[i, i] = max(P[i, i], _PRIOR_SIGMA[i] ** 2)
+        return replace(self, covariance=_rows(P))
 
 
 @dataclass(frozen=True)
@@ -248,7 +256,9 @@ def watch_load(
     stands = not vehicle.armed or vehicle.landed
     grounded = stands or (old.grounded and not vehicle.velocity_w[2] < -_CLIMB_M_PER_S)
     if grounded or not (up > _UPRIGHT and vehicle.thrust > _LEAST_SHARE):  # also where the thrust is nan
-        curve = None if old.curve is None else old.curve.forget(dt)
+        curve = old.curve
+        if curve is not None:
+            curve = curve.forget(dt) if vehicle.armed else curve.unplugged()
         return replace(interrupted(old), curve=curve, grounded=grounded)
     new = Flow(up, up * vehicle.thrust, vehicle.velocity_w[2])
     flow, seen_s, curve = _filtered(old.flow or new, new, dt, lag_s), old.seen_s + dt, old.curve

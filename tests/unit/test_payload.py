@@ -214,6 +214,31 @@ def test_what_is_known_of_the_curve_fades_while_nothing_can_be_learnt() -> None:
     assert later.theta == load.curve.theta
 
 
+def test_a_battery_may_be_swapped_while_the_vehicle_is_disarmed() -> None:
+    load = climb_and_hover(Rotors(), seconds=120.0)
+    assert load.curve is not None
+    waiting = watch_load(load, VehicleState(armed=True, landed=True, thrust=0.1), MASS, DT, lifted=0.0)
+    assert waiting.curve is not None
+    assert waiting.curve.calibrated, "rotors that idle have the battery that they had"
+    for _ in range(2):
+        load = watch_load(load, VehicleState(armed=False, landed=True, thrust=0.0), MASS, DT, lifted=0.0)
+    stood, prior = load.curve, ThrustCurve.prior(0.45)
+    assert stood is not None
+    assert not stood.calibrated
+    assert stood.covariance[0][0] == prior.covariance[0][0], "as much as the prior's, however long it stands"
+    assert stood.covariance[3][3] == prior.covariance[3][3]
+    assert stood.covariance[1][1] < 0.5 * prior.covariance[1][1], "the rotors are the same"
+    assert np.linalg.eigvalsh(np.array(stood.covariance)).min() > 0.0
+    fuller = Rotors(hover=0.45 * 0.94, seed=2)  # a full battery: 6 % more thrust at the same share, 0.6 m/s^2
+    load, off = climb_and_hover(fuller, load, 4.0), []
+    for i in range(400):
+        load = watch_load(load, fuller.step(0.0, 0.0), MASS, DT, lifted=0.0)
+        if i % 50 == 0 and load.calibrated:
+            off.append(abs(load.now) / load.sigma_now(MASS))
+    assert off
+    assert max(off) < 3.0
+
+
 def test_a_time_that_stands_still_changes_nothing() -> None:
     load = climb_and_hover(Rotors())
     assert watch_load(load, Rotors().step(0.0, 0.0), MASS, 0.0, lifted=0.0) == load
