@@ -192,8 +192,7 @@ def report(s: Situation) -> PayloadReport | None:
     if s.gripping:
         place = (0.0, 0.0, s.parameters.model.parameters.L + s.config.gripper.depth_m)
     centre = s.mount.position + R @ place
-    along, across, down = _GRIP_SIGMA
-    spread = (math.hypot(along * x, across * y), math.hypot(along * y, across * x), down)
+    spread = grip_sigma_a(s)
     sigma = [math.sqrt(sum((R[i, j] * spread[j]) ** 2 for j in range(3))) for i in range(3)]
     return PayloadReport(
         load.mass,
@@ -202,6 +201,13 @@ def report(s: Situation) -> PayloadReport | None:
         (sigma[0], sigma[1], sigma[2]),
         valid=load.known,
     )
+
+
+def grip_sigma_a(s: Situation) -> Vec3:
+    """One sigma of where the middle of what is carried sits, m, base axes."""
+    x, y = s.towards_bar_a
+    along, across, down = _GRIP_SIGMA
+    return math.hypot(along * x, across * y), math.hypot(along * y, across * x), down
 
 
 def _loop_radius(s: Situation) -> float:

@@ -17,7 +17,7 @@ from arm_companion.geometry.wrench import rotation_matrix
 from arm_companion.mission import carry
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.hung_wrench import hung_wrench
-from arm_companion.mission.motion import ZERO, sub
+from arm_companion.mission.motion import ZERO, sub, unrotate
 from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CALIBRATES, CARRYING, TIP, Anchor, Phase, Prediction
@@ -207,6 +207,8 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
         return _nothing(source)
     if holding:
         found = _weigh(found, s)
+    elif (load := carry.payload(s)) is not None:
+        found = _gripped(found, s, load.mass)
     # how the bar pushes on an arm that touches but does not hold is not known
     report = _report(found, source, valid=source is not WrenchSource.CONTACT)
     return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
@@ -223,6 +225,19 @@ def _spread(s: Situation, solution: ArmSolution) -> Spread:
         return _SPREAD
     sigma = s.state.load.sigma(s.config.vehicle.mass_kg) / max(solution.moments.mass, 1e-6)
     return replace(_SPREAD, mass=math.hypot(_SPREAD.mass, sigma))
+
+
+def _gripped(found: Reaction, s: Situation, mass: float) -> Reaction:
+    """With what is not known of a load besides its weight: where in the grip it sits.
+
+    Its weight turns about another place then, and so does what is not known of the force: under a vehicle that hovers
+    level nothing else turns it about the vertical.
+    """
+    weight_b = mass * np.asarray(unrotate(s.facts.vehicle.attitude_wb, (0.0, 0.0, GRAVITY)))
+    R, place = s.mount.rotation, np.square(carry.grip_sigma_a(s))
+    force, torque = found.sigma[:3] ** 2, found.sigma[3:] ** 2
+    torque = torque + np.square(so3.hat(weight_b) @ R) @ place + np.square(so3.hat(np.sqrt(force))) @ (R**2 @ place)
+    return replace(found, sigma=np.concatenate((found.sigma[:3], np.sqrt(torque))))
 
 
 def _weigh(found: Reaction, s: Situation) -> Reaction:

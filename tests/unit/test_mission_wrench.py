@@ -1,4 +1,4 @@
-"""What is fed forward when the mechanics fail in the middle of a move."""
+"""What is fed forward when the mechanics fail in the middle of a move, and how sure the wrench is of itself."""
 
 import dataclasses
 import math
@@ -9,14 +9,16 @@ import pytest
 
 from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.parameters import ArmParameters
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import NoSolution
-from arm_companion.mission.facts import Facts
-from arm_companion.mission.motion import norm
+from arm_companion.mission.facts import Facts, Vec3, WrenchReport
+from arm_companion.mission.motion import norm, rotate
+from arm_companion.mission.payload import Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, State
 from arm_companion.mission.wrench import grip
-from tests.unit.mission_rig import BENT, PLACE, T0, memory, run
+from tests.unit.mission_rig import BENT, PLACE, T0, gripping, memory, run
 
 Hovering = Callable[..., Facts]
 
@@ -79,3 +81,29 @@ def test_what_is_held_on_to_ends_with_the_grip(moody: Parameters, hovering: Hove
     state = dataclasses.replace(state, phase=Phase.UNLOAD, since=state.t, offset=(0.0, 0.0, 0.0))
     state, _ = run(state, facts, moody, 1.0)
     assert norm(state.lean) == 0.0
+
+
+def carrying(kilograms: float, **fields: object) -> State:
+    """Memory of a load that has been weighed."""
+    load = Load(ThrustCurve.prior(0.5), Flow(1.0, 0.5, 0.0), 5.0, kilograms, kilograms, 0.03, 5.0)
+    return memory(Phase.CARRY, load=load, **fields)
+
+
+def world(wrench: WrenchReport, facts: Facts) -> Vec3:
+    return rotate(facts.vehicle.attitude_wb, wrench.force_b)
+
+
+@pytest.mark.parametrize("gripper", [False, True])
+def test_where_a_load_sits_in_the_grip_is_in_the_torques_sigma(
+    gripper: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    chosen = gripping(parameters) if gripper else parameters
+    facts = hovering((0.0, 0.0) if gripper else BENT)
+    _, said = run(carrying(0.2), facts, chosen)
+    sigma, weight = said[0].wrench.torque_sigma, 0.2 * GRAVITY
+    assert said[0].payload is not None
+    along, across, _ = said[0].payload.centre_of_mass_sigma
+    assert sigma[0] > weight * across
+    assert sigma[1] > weight * along
+    assert sigma[2] > 5e-4, "nothing is known for sure"
+    assert max(sigma) < 0.1
