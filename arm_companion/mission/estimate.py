@@ -52,22 +52,41 @@ class ForceObserver:
             return (0.0, 0.0)
         return (self.force[0] - self.bias[0], self.force[1] - self.bias[1])
 
+    def acceleration(self, vehicle: VehicleState, mass: float) -> Vec2:
+        """Acceleration of the vehicle, m/s^2, north and east: what its tilt makes, and what is felt besides.
+
+        Args:
+            vehicle: newest state, fresh.
+            mass: kg, with which it was observed; it cancels out.
+        """
+        lean = _lean(vehicle)
+        if lean is None or self.velocity is None:
+            return (0.0, 0.0)
+        return (lean[0] + self.force[0] / mass, lean[1] + self.force[1] / mass)
+
 
 def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: float) -> ForceObserver:
     """The observer after one cycle of `dt` seconds with a vehicle of `mass` kg."""
     v = (vehicle.velocity_w[0], vehicle.velocity_w[1])
     if old.velocity is None or dt <= 0.0:
         return replace(old, velocity=v)
-    up = rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))
-    if up[2] > -0.5:  # more than 60 degrees of tilt: not a hover, and nothing can be said
+    lean = _lean(vehicle)
+    if lean is None:
         return replace(old, velocity=v)
-    lean = (GRAVITY * up[0] / -up[2], GRAVITY * up[1] / -up[2])
     velocity, force = [], []
     for i in range(2):
         miss = v[i] - old.velocity[i]
         velocity.append(old.velocity[i] + dt * (lean[i] + old.force[i] / mass + 2.0 * _POLE * miss))
         force.append(old.force[i] + dt * mass * _POLE * _POLE * miss)
     return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]))
+
+
+def _lean(vehicle: VehicleState) -> Vec2 | None:
+    """Horizontal acceleration that the tilted thrust makes, m/s^2; None: far from a hover, and nothing can be said."""
+    up = rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))
+    if up[2] > -0.5:  # more than 60 degrees
+        return None
+    return (GRAVITY * up[0] / -up[2], GRAVITY * up[1] / -up[2])
 
 
 def tare(old: ForceObserver, dt: float) -> ForceObserver:

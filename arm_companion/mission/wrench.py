@@ -199,7 +199,7 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
             solution,
             s.mount,
             np.asarray(s.gravity_a),
-            BodyMotion(rate=np.asarray(vehicle.rate_b)),
+            _motion(s, holding=holding),
             spread=_spread(s, solution),
             age=max(vehicle.position_age_s, vehicle.attitude_age_s),
         )
@@ -212,6 +212,19 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     # how the bar pushes on an arm that touches but does not hold is not known
     report = _report(found, source, valid=source is not WrenchSource.CONTACT)
     return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
+
+
+def _motion(s: Situation, *, holding: bool) -> BodyMotion:
+    """Of the airframe: a vehicle tilts to accelerate, and what hangs on it feels thrust then, and not the tilt.
+
+    Up and down none is told: our set-points go up and down gently, and the tilt says nothing of it.
+    """
+    vehicle = s.facts.vehicle
+    rate = np.asarray(vehicle.rate_b)
+    if holding:  # it stands still, and what is felt is the arm
+        return BodyMotion(rate=rate)
+    north, east = s.state.force.acceleration(vehicle, s.config.vehicle.mass_kg)
+    return BodyMotion(so3.from_quaternion(vehicle.attitude_wb).T @ np.array((north, east, 0.0)), rate)
 
 
 def _touches(s: Situation) -> bool:

@@ -12,6 +12,7 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import NoSolution
+from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import Facts, Vec3, WrenchReport
 from arm_companion.mission.motion import norm, rotate
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
@@ -91,6 +92,24 @@ def carrying(kilograms: float, **fields: object) -> State:
 
 def world(wrench: WrenchReport, facts: Facts) -> Vec3:
     return rotate(facts.vehicle.attitude_wb, wrench.force_b)
+
+
+@pytest.mark.parametrize("kilograms", [0.0, 0.2, 0.5])
+def test_a_vehicle_that_tilts_to_accelerate_feels_what_hangs_on_it_lag_behind(
+    kilograms: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    """What hangs on the airframe is pulled along by it: f = -m (a - g), whatever the tilt."""
+    tilt = 0.06
+    tilted = (math.cos(tilt / 2.0), 0.0, -math.sin(tilt / 2.0), 0.0)  # nose down: northwards
+    a = GRAVITY * math.tan(tilt)
+    facts = hovering(BENT if kilograms else (0.0, 0.0), attitude_wb=tilted)
+    fields: dict[str, object] = {"force": ForceObserver(velocity=(0.0, 0.0))}
+    state = carrying(kilograms, **fields) if kilograms else memory(Phase.READY, **fields)
+    mass = parameters.model.parameters.mass + kilograms
+    after, said = run(state, facts, parameters)
+    assert world(said[0].wrench, facts) == pytest.approx((-mass * a, 0.0, mass * GRAVITY), abs=0.02)
+    _, said = run(after, facts, parameters, 3.0)  # it goes on leaning, and stays where it is: that is wind
+    assert world(said[-1].wrench, facts)[0] == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.parametrize("gripper", [False, True])
