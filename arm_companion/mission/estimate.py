@@ -35,7 +35,7 @@ class ForceObserver:
         velocity: estimate (2,), m/s; None before the first state.
         force: estimate (2,), N, with whatever wind and level error put on top.
         bias: mean of `force` while the arm was certainly free (2,), N.
-        tared_s: length of that mean, s.
+        tared_s: time since that mean was begun, s; its first second is the mean's.
         above_s: how long the residual has been above the threshold without a break, s.
     """
 
@@ -51,6 +51,11 @@ class ForceObserver:
         if self.tared_s < _TARE_S:
             return (0.0, 0.0)
         return (self.force[0] - self.bias[0], self.force[1] - self.bias[1])
+
+    @property
+    def bias_age_s(self) -> float:
+        """For how long the wind may have changed since the bias was found, s; inf: it is not known."""
+        return self.tared_s - _TARE_S if self.tared_s >= _TARE_S else math.inf
 
     def acceleration(self, vehicle: VehicleState, mass: float) -> Vec2:
         """Acceleration of the vehicle, m/s^2, north and east: what its tilt makes, and what is felt besides.
@@ -70,15 +75,16 @@ def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: fl
     v = (vehicle.velocity_w[0], vehicle.velocity_w[1])
     if old.velocity is None or dt <= 0.0:
         return replace(old, velocity=v)
+    tared_s = old.tared_s + dt if old.tared_s >= _TARE_S else old.tared_s
     lean = _lean(vehicle)
     if lean is None:
-        return replace(old, velocity=v)
+        return replace(old, velocity=v, tared_s=tared_s)
     velocity, force = [], []
     for i in range(2):
         miss = v[i] - old.velocity[i]
         velocity.append(old.velocity[i] + dt * (lean[i] + old.force[i] / mass + 2.0 * _POLE * miss))
         force.append(old.force[i] + dt * mass * _POLE * _POLE * miss)
-    return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]))
+    return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]), tared_s=tared_s)
 
 
 def _lean(vehicle: VehicleState) -> Vec2 | None:

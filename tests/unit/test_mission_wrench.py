@@ -5,6 +5,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from arm_companion.arm.model import ArmSolution
@@ -126,3 +127,25 @@ def test_where_a_load_sits_in_the_grip_is_in_the_torques_sigma(
     assert sigma[1] > weight * along
     assert sigma[2] > 5e-4, "nothing is known for sure"
     assert max(sigma) < 0.1
+
+
+def test_the_longer_ago_the_tare_the_less_sure_is_the_force_of_a_held_arm_and_no_other(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = hovering(BENT)
+    state = moving(parameters, facts)
+    told = []
+    for seconds in (1.0, 11.0, 601.0, 0.0):
+        force = ForceObserver(velocity=(0.0, 0.0), tared_s=seconds)
+        _, said = run(dataclasses.replace(state, offset=(0.0, 0.0, 0.0), force=force), facts, parameters)
+        told.append(said[0].wrench)
+    fresh, later, old, never = told
+    assert fresh.force_sigma[0] < 0.31
+    assert 0.6 < later.force_sigma[0] < old.force_sigma[0]
+    assert 1.3 < old.force_sigma[0] < 1.5, "a wind of 3 N that came after the grip is within two of them"
+    assert never.force_sigma == pytest.approx(old.force_sigma, rel=0.01)
+    assert old.torque_sigma[1] > fresh.torque_sigma[1]
+    for other in (later, old):
+        assert other.force_b == pytest.approx(fresh.force_b, abs=1e-6)
+        assert other.force_sigma[2] == pytest.approx(fresh.force_sigma[2], rel=1e-6)
+    assert np.isfinite(old.torque_sigma).all()
