@@ -137,7 +137,7 @@ def _draw_tendons(axis: Axes, flight: Flight, config: Config, start: float) -> N
             alpha=0.5,
         )
     axis.set_ylabel("tendon tension, N\n(thin: estimated)")
-    axis.legend(loc="center left", ncols=4, fontsize=8, frameon=False)
+    axis.legend(loc="upper left", ncols=4, fontsize=8, frameon=False)
 
 
 def _draw_force(axis: Axes, flight: Flight, start: float) -> None:
@@ -154,7 +154,7 @@ def _draw_force(axis: Axes, flight: Flight, start: float) -> None:
             label=f"{name} predicted",
         )
     axis.set_ylabel("force on the airframe, N\n(line: true, dots: predicted)")
-    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+    axis.legend(loc="upper left", ncols=3, fontsize=8, markerscale=3, frameon=False)
 
 
 def _draw_contact(axis: Axes, flight: Flight, start: float) -> None:
