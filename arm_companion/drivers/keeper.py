@@ -3,10 +3,10 @@
 import contextlib
 import logging
 import os
-import queue
-import threading
 from pathlib import Path
 from typing import Final
+
+from arm_companion.drivers.writer import Writer
 
 log = logging.getLogger(__name__)
 
@@ -17,42 +17,25 @@ class Keeper:
     """Writes files, of each the newest content."""
 
     def __init__(self) -> None:
-        self._queue: queue.SimpleQueue[tuple[Path, bytes] | None] = queue.SimpleQueue()
-        self._thread: threading.Thread | None = None
+        self._newest: dict[Path, bytes] = {}  # only the thread takes out of it
+        self._writer = Writer("keeper")
 
     def put(self, file: Path, data: bytes) -> None:
         """Write `data` to `file` soon; an error is logged, and the old file is left."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._write, name="keeper", daemon=True)
-            self._thread.start()
-        self._queue.put((file, data))
+        self._newest[file] = data
+        self._writer.submit(self._write)
 
     def close(self) -> None:
         """Write what is left and stop; give up on a disk that hangs."""
-        if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join(_CLOSE_WITHIN_S)
-            self._thread = None
+        self._writer.close(_CLOSE_WITHIN_S)
 
     def _write(self) -> None:
-        ended = False
-        while not ended:
-            newest: dict[Path, bytes] = {}
-            item = self._queue.get()
-            while True:
-                if item is None:
-                    ended = True
-                    break
-                newest[item[0]] = item[1]
-                try:
-                    item = self._queue.get_nowait()
-                except queue.Empty:
-                    break
-            for file, data in newest.items():
-                try:
-                    write_atomically(file, data)
-                except OSError as error:
-                    log.error("%s is not kept: %s", file, error)  # noqa: TRY400 - the error says it all
+        while self._newest:
+            file, data = self._newest.popitem()
+            try:
+                write_atomically(file, data)
+            except OSError as error:
+                log.error("%s is not kept: %s", file, error)  # noqa: TRY400 - the error says it all
 
 
 def write_atomically(file: Path, data: bytes) -> None:

@@ -35,11 +35,11 @@ class Writer:
         self._jobs.put(partial(_do, future, partial(work, *args, **kwargs)))
         return future
 
-    def close(self) -> None:
+    def close(self, within_s: float = _CLOSE_WITHIN_S) -> None:
         """Do what is left, and end; give up on a job that hangs."""
         if self._thread is not None:
             self._jobs.put(None)
-            self._thread.join(_CLOSE_WITHIN_S)
+            self._thread.join(within_s)
             if self._thread.is_alive():
                 _log.error("%s: the disk does not answer; what is left to be written is lost", self._name)
             self._thread = None

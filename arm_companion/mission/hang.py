@@ -110,14 +110,10 @@ def _still_wrapped(s: Situation, reason: str | None) -> str | None:
 
 def motors_drop(s: Situation) -> str | None:
     """The motors no longer carry the vehicle, and the arm is still so far around the bar that it can."""
-    half = 0.5 * s.config.perch.wrap_bend_rad
-    if not s.arm_above or not sharing.dropped(s) or (s.state.phase is Phase.RELEASE and _bend(s) < half):
+    half_open = s.state.phase is Phase.RELEASE and math.hypot(*s.state.bend) < 0.5 * s.config.perch.wrap_bend_rad
+    if not s.arm_above or not sharing.dropped(s) or half_open:
         return None
     return f"the motors no longer carry the vehicle: throttle {s.facts.vehicle.throttle:.0%}"
-
-
-def _bend(s: Situation) -> float:
-    return math.hypot(*s.state.bend)
 
 
 # --- orders ---
