@@ -10,7 +10,7 @@ from arm_companion.mission import gripper
 from arm_companion.mission.facts import PayloadReport, Vec3
 from arm_companion.mission.grasp import LIGHT_SHARE, low
 from arm_companion.mission.motion import ZERO, add, norm, scale, sub
-from arm_companion.mission.payload import ROTOR_LAG_S, Load, interrupted, watch_load, weigh
+from arm_companion.mission.payload import ROTOR_LAG_S, Found, Load, interrupted, watch_load, weigh
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Anchor, Phase, State
 from arm_companion.values import replace
@@ -46,6 +46,23 @@ _GRIP_SIGMA = (0.015, 0.03, 0.015)  # m, base axes: along the bend, along the ob
 
 def track_load(s: Situation) -> Load:
     """The load after this cycle; a mean begins anew with every lift."""
+    load = _lifted(s)
+    if s.state.phase is not Phase.VERIFY or not s.grasping:
+        return replace(load, found=None, found_s=0.0)
+    found = _found(s, load.now)
+    return replace(load, found=found, found_s=load.found_s + s.dt if found is load.found else 0.0)
+
+
+def _found(s: Situation, now: float) -> Found | None:
+    if math.isnan(now):
+        return None
+    grasp = s.config.grasp
+    if now > grasp.mass_max_kg:
+        return Found.TOO_MUCH
+    return Found.ENOUGH if now >= grasp.mass_min_kg else Found.LITTLE
+
+
+def _lifted(s: Situation) -> Load:
     state = s.state
     if not s.vehicle_fresh:
         return interrupted(state.load)

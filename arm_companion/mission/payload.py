@@ -22,6 +22,7 @@ a curve that is fitted to those answers becomes flatter with every minute.
 
 import math
 from dataclasses import dataclass
+from enum import Enum, auto
 
 import numpy as np
 
@@ -171,6 +172,14 @@ class ThrustCurve:
         return replace(self, covariance=_rows(P))
 
 
+class Found(Enum):
+    """What a test lift finds on the arm."""
+
+    LITTLE = auto()
+    ENOUGH = auto()
+    TOO_MUCH = auto()
+
+
 @dataclass(frozen=True)
 class Load:
     """The load on the arm, as far as thrust tells.
@@ -185,6 +194,8 @@ class Load:
         weighed_s: length of that mean, s.
         grip: tension of the tightest tendon while carrying, N, smoothed.
         light_s: how long `now` has been too little for the mean.
+        found: what the test lift finds at this moment; None: it cannot be told, or there is no test lift.
+        found_s: how long it has found just that.
         grounded: the vehicle has been seen to stand, and has not climbed since.
     """
 
@@ -197,6 +208,8 @@ class Load:
     weighed_s: float = 0.0
     grip: float = 0.0
     light_s: float = 0.0
+    found: Found | None = None
+    found_s: float = 0.0
     grounded: bool = False
 
     @property

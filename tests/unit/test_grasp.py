@@ -178,9 +178,22 @@ def test_the_test_lift_tells_an_object_from_nothing_and_from_what_is_too_much(
     kilograms: float, up: float, after: Phase, words: str, parameters: Parameters, hovering: Hovering
 ) -> None:
     run = Run(carrying(Phase.VERIFY, up=up, now=kilograms, task=Order.GRASP, since=T0 - 8.0), parameters)
-    run.cycles(aloft(hovering, kilograms, up), 1.5)
+    run.cycles(aloft(hovering, kilograms, up), 3.5)
     assert run.phases[1] is after
     assert any(words in text for text in run.texts)
+
+
+@pytest.mark.parametrize(("first", "then"), [(0.03, 0.16), (0.55, 0.16), (math.nan, 0.16), (0.16, 0.0)])
+def test_what_the_test_lift_finds_has_to_last(
+    first: float, then: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    """As an object breaks free of its cradle the vehicle jumps, and weighs nothing or too much for a moment."""
+    now = 0.0 if math.isnan(first) else first
+    run = Run(carrying(Phase.VERIFY, up=0.05, now=now, task=Order.GRASP, since=T0 - 8.0), parameters)
+    run.cycles(aloft(hovering, first, 0.05), 0.2)
+    assert run.phases == [Phase.VERIFY]
+    run.cycles(aloft(hovering, then, 0.05), 3.0)
+    assert run.phases[1] is (Phase.LIFT if then else Phase.UNLOAD)
 
 
 def test_a_load_is_weighed_reported_predicted_and_held_up(parameters: Parameters, hovering: Hovering) -> None:
