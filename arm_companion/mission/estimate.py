@@ -132,6 +132,11 @@ def smooth_position(old: Vec3, vehicle: VehicleState, dt: float) -> Vec3:
     return add(old, scale(sub(new, old), dt / (_POSITION_SMOOTHING_S + dt)))
 
 
+def delayed(old: Vec3, push: Vec3, dt: float) -> Vec3:
+    """What the observers have felt of a `push` that is known, by their lag."""
+    return add(old, scale(sub(push, old), dt / (OBSERVER_LAG_S + dt)))
+
+
 def strength(force: Vec2) -> float:
     """Magnitude, N."""
     return math.hypot(*force)

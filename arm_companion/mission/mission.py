@@ -3,7 +3,14 @@
 from arm_companion.arm.tension import fuse
 from arm_companion.errors import CommandRejected
 from arm_companion.mission import actions, calibrating, carry, gripper, reaching
-from arm_companion.mission.estimate import observe_force, smooth_position, smooth_tensions, tare, time_above
+from arm_companion.mission.estimate import (
+    delayed,
+    observe_force,
+    smooth_position,
+    smooth_tensions,
+    tare,
+    time_above,
+)
 from arm_companion.mission.facts import (
     Answer,
     ArmAction,
@@ -110,6 +117,7 @@ def _estimate(s: Situation) -> State:
     return replace(
         state,
         force=force,
+        felt=delayed(state.felt, state.lean, s.dt),
         tension=smooth_tensions(state.tension, s.facts.tendons, s.dt),
         watch=watch(state.watch, s.facts.tendons, expected, s.dt, s.config.limits),
         load=carry.track_load(s),

@@ -266,6 +266,7 @@ class State:
     rest: Vec3 | None = None  # m, where the anchored vehicle stays by itself; moves are counted from here
     prediction: Prediction | None = None
     lean: Vec3 = ZERO  # m/s^2, acceleration fed forward now
+    felt: Vec3 = ZERO  # m/s^2, as much of it as has come through the observers' lag
     offset: Vec3 = ZERO  # m, asked move away from the anchor
     kind: PerchKind = PerchKind.ANCHOR  # of the perch ordered last
     sharing: Sharing = Sharing()

@@ -17,7 +17,7 @@ from arm_companion.geometry.wrench import rotation_matrix
 from arm_companion.mission import carry
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
 from arm_companion.mission.hung_wrench import hung_wrench
-from arm_companion.mission.motion import ZERO, sub, unrotate
+from arm_companion.mission.motion import ZERO, add, scale, sub, unrotate
 from arm_companion.mission.sharing import SHARING, SUSPENDED
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CALIBRATES, CARRYING, TIP, Anchor, Phase, Prediction
@@ -271,7 +271,8 @@ def _weigh(found: Reaction, s: Situation) -> Reaction:
     model_variance = R_wb**2 @ found.sigma[:3] ** 2 + np.square(_SLIDE_SIGMA)
     down, down_variance = _carried(s)
     weight = s.parameters.model.parameters.mass * GRAVITY  # of the whole arm: the wrap's, too, was the rotors' before
-    felt = np.array((*s.state.force.residual, weight + down))
+    north, east, _ = add((*s.state.force.residual, 0.0), _unseen(s))
+    felt = np.array((north, east, weight + down))
     felt_variance = np.array((*np.square(_FELT_SIGMA[:2]), down_variance))
     share = felt_variance / (felt_variance + model_variance)
     force = R_wb.T @ (share * model + (1.0 - share) * felt)
@@ -284,6 +285,11 @@ def _weigh(found: Reaction, s: Situation) -> Reaction:
         wrench=np.concatenate((force, so3.cross(arm, force))),
         sigma=np.concatenate((sigma, np.hypot(lever, _MOMENT_SIGMA))),
     )
+
+
+def _unseen(s: Situation) -> Vec3:
+    """Force of the arm against our own push, N, world axes, as far as the observers have yet to see it."""
+    return scale(sub(s.state.felt, s.state.lean), s.config.vehicle.mass_kg)
 
 
 def _wind_variance(s: Situation) -> float:
@@ -302,7 +308,7 @@ def _carried(s: Situation) -> tuple[float, float]:
     if math.isnan(load.now):
         return push, variance
     share = variance / (variance + (load.sigma_now(mass) * GRAVITY) ** 2)
-    return push + share * (load.now * GRAVITY - push), (1.0 - share) * variance
+    return push + share * (load.now * GRAVITY + _unseen(s)[2] - push), (1.0 - share) * variance
 
 
 def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:

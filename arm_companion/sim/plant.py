@@ -79,14 +79,17 @@ class Plant:
         self._straight_rest = config.arm.length_m - config.arm.tendons.pretension_n / self._stiffness
         # views of MuJoCo's own memory, made once because a step asks for them all
         self._qpos, self._qvel, self._applied = self._data.qpos, self._data.qvel, self._data.qfrc_applied[:6]
+        self._cut = self._data.cfrc_int[self._base]
         self._lengths, self._rest = self._data.ten_length, model.tendon_lengthspring[:, 1]
         self._tendon_damping = model.tendon_damping
         self._longer = np.zeros(model.ntendon)  # m, by what has happened to each tendon
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
+        self._wrench_sum, self._steps = np.zeros((2, 3)), 0
         mujoco.mj_forward(model, self._data)
         self._set_pulls((0.0,) * model.ntendon)
         self._data.qacc[:] = 0.0
+        self._wrench = self._interface_wrench()
 
     @property
     def time(self) -> float:
@@ -123,6 +126,9 @@ class Plant:
         self._velocity_before[:] = self._qvel
         self._truth = None
         mujoco.mj_step(self._model, self._data)
+        self._wrench = self._interface_wrench()
+        self._wrench_sum += self._wrench
+        self._steps += 1
 
     def state(self) -> RigidState:
         """True motion of the airframe now; the specific force is the last step's mean."""
@@ -153,6 +159,15 @@ class Plant:
         if self._truth is None:
             self._truth = self._measure()
         return self._truth
+
+    def mean_wrench(self) -> tuple[Vec3, Vec3]:
+        """Force and torque of `truth` as means over the steps since this was asked last.
+
+        A wrap that slips strikes for milliseconds: one step's force says nothing of what the airframe felt.
+        """
+        force, torque = self._wrench if not self._steps else (_vec3(v) for v in self._wrench_sum / self._steps)
+        self._wrench_sum[:], self._steps = 0.0, 0
+        return force, torque
 
     def move_bar(self, position_w: Sequence[float]) -> None:
         """Put the bar elsewhere, with its heading kept.
@@ -208,7 +223,7 @@ class Plant:
 
     def _measure(self) -> PlantTruth:
         model, data = self._model, self._data
-        force, torque = self._interface_wrench()
+        force, torque = self._wrench
         contact, net, wrap = self._bar_contact()
         bodies = model.geom_bodyid[data.contact.geom]
         ground = np.isin(bodies, list(self._ground))
@@ -240,19 +255,22 @@ class Plant:
         really made: under implicit integration they differ from the forward dynamics' own.
         """
         model, data = self._model, self._data
-        velocity = data.qvel.copy()
-        data.qacc[:] = (velocity - self._velocity_before) / self._dt
-        data.qvel[:] = self._velocity_before
+        velocity = self._qvel.copy()
+        np.subtract(velocity, self._velocity_before, out=data.qacc)
+        data.qacc /= self._dt
+        self._qvel[:] = self._velocity_before
         mujoco.mj_rnePostConstraint(model, data)
-        data.qvel[:] = velocity
-        wrench = data.cfrc_int[self._base]  # torque, force of the airframe on the arm, about the tree's centre
-        centre = data.subtree_com[self._airframe] - data.xpos[self._airframe]
-        rotation = data.xmat[self._airframe].reshape(3, 3)
-        force = -wrench[3:]
-        torque = -wrench[:3] + np.cross(centre, force)
-        pushed, twisted = self._arm_against_airframe()
-        force, torque = force + pushed, torque + twisted
-        return _vec3(rotation.T @ force), _vec3(rotation.T @ torque)
+        self._qvel[:] = velocity
+        # torque, force of the airframe on the arm, about the tree's centre
+        tx, ty, tz, fx, fy, fz = self._cut.tolist()
+        x, y, z = (data.subtree_com[self._airframe] - data.xpos[self._airframe]).tolist()
+        force = (-fx, -fy, -fz)
+        torque = (z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz)
+        if data.ncon and np.any(model.geom_bodyid[data.contact.geom] == self._airframe):
+            pushed, twisted = self._arm_against_airframe()
+            force, torque = _vec3(pushed + force), _vec3(twisted + torque)
+        turn = data.xmat[self._airframe].reshape(3, 3).T.tolist()
+        return _turned(turn, force), _turned(turn, torque)
 
     def _arm_against_airframe(self) -> tuple[Array, Array]:
         """Force and torque, world axes up, about the airframe's centre of mass, of links that lie against it."""
@@ -320,6 +338,12 @@ def _matrix(w: float, x: float, y: float, z: float) -> Array:
 def _upright(w: float, x: float, y: float, z: float) -> tuple[float, float, float, float]:
     """The one of a rotation's two quaternions that has w >= 0."""
     return (w, x, y, z) if w >= 0 else (-w, -x, -y, -z)
+
+
+def _turned(rotation: list[list[float]], v: Vec3) -> Vec3:
+    x, y, z = v
+    a, b, c = rotation
+    return (a[0] * x + a[1] * y + a[2] * z, b[0] * x + b[1] * y + b[2] * z, c[0] * x + c[1] * y + c[2] * z)
 
 
 def _vec3(v: Array) -> Vec3:

@@ -7,7 +7,7 @@ simulated time the loop jumps from step to step, so the same program runs as fas
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -31,7 +31,7 @@ _TICKS_PER_RAD = 4096 / (2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The truth at one instant, with the loop time at which it held."""
+    """The truth at one instant, with the loop time at which it held; its wrench is the mean since the sample before."""
 
     t: float
     state: RigidState
@@ -121,7 +121,9 @@ class World:
                 self._advance()
                 periods += 1
                 if periods % sampled == 0:
-                    self.samples.append(Sample(tick.now, self.plant.state(), self.plant.truth()))
+                    force, torque = self.plant.mean_wrench()
+                    truth = replace(self.plant.truth(), force_b=force, torque_b=torque)
+                    self.samples.append(Sample(tick.now, self.plant.state(), truth))
 
     def _advance(self) -> None:
         """One control period."""

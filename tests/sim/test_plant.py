@@ -155,6 +155,24 @@ def test_the_wrench_is_what_the_airframe_feels(monkeypatch: pytest.MonkeyPatch) 
     assert not world.truth().body_contact
 
 
+def test_the_mean_wrench_has_every_step_in_it_once() -> None:
+    """A blow of milliseconds between two samples is felt by the airframe, and one in a sample is no lasting force."""
+    world = Plant(Config())
+    run(world, 0.3, RotorCommand(1.5 * WEIGHT, (0.0, 0.0, 0.0)))
+    world.move_bar(beside(world, (0.06, 0.0, 0.25)))
+    world.mean_wrench()
+    forces, torques = [], []
+    for i in range(200):
+        world.step(RotorCommand(WEIGHT, (0.0, 0.0, 0.0)), (min(i * 2e-4, 0.03), 0.0, -min(i * 2e-4, 0.03), 0.01))
+        forces.append(world.truth().force_b)
+        torques.append(world.truth().torque_b)
+    assert np.ptp(forces, axis=0).max() > 1.0, "there was a blow"
+    force, torque = world.mean_wrench()
+    assert force == pytest.approx(np.mean(forces, axis=0), abs=1e-9)
+    assert torque == pytest.approx(np.mean(torques, axis=0), abs=1e-9)
+    assert world.mean_wrench()[0] == forces[-1], "with no step since, the last one's"
+
+
 def cross_matrix(v: Vec3) -> Array:
     return np.array(((0.0, -v[2], v[1]), (v[2], 0.0, -v[0]), (-v[1], v[0], 0.0)))
 

@@ -149,3 +149,23 @@ def test_the_longer_ago_the_tare_the_less_sure_is_the_force_of_a_held_arm_and_no
         assert other.force_b == pytest.approx(fresh.force_b, abs=1e-6)
         assert other.force_sigma[2] == pytest.approx(fresh.force_sigma[2], rel=1e-6)
     assert np.isfinite(old.torque_sigma).all()
+
+
+def test_a_push_of_our_own_is_in_the_wrench_before_the_observers_have_seen_it(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    """They lag by a quarter of a second, in which a vehicle that pulls down changes its pull by a third of a newton."""
+    facts = hovering(BENT)
+    state = dataclasses.replace(moving(parameters, facts), offset=(0.0, 0.0, 0.0), since=T0 - 30.0)
+    lean = (0.5, -0.25, 0.25)
+    _, known = run(dataclasses.replace(state, lean=lean, felt=lean), facts, parameters)
+    _, new = run(dataclasses.replace(state, lean=lean, felt=(0.0, 0.0, 0.0)), facts, parameters)
+    ahead = np.subtract(new[0].wrench.force_b, known[0].wrench.force_b)
+    mass = parameters.config.vehicle.mass_kg
+    share = ahead[:2] / (-mass * np.array(lean[:2]))  # the elastic model has its say too, aside more than ahead
+    assert 0.9 < share[0] < 1.0
+    assert 0.5 < share[1] < 1.0
+    # down, where the rotors' thrust is not known here, the push itself is all there is
+    assert ahead[2] == pytest.approx(0.0, abs=1e-3)
+    state, _ = run(dataclasses.replace(state, lean=lean, felt=(0.0, 0.0, 0.0)), facts, parameters, 0.5)
+    assert norm(state.felt) > 0.1, "and then they have"
