@@ -22,6 +22,7 @@ _CONFIGS = {
     "grasp": "sim_grasp.toml",
     "abort": "sim.toml",
     "gust": "sim_gust.toml",
+    "reach": "sim.toml",
     "world": "sim.toml",
 }
 TOO_SLOW = 75
@@ -38,8 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(_CONFIGS),
         help="perch: take off, wrap a bar, be pulled, let go, land; hang: wrap a bar overhead, hang with idle motors, "
         "let go, land; grasp: pick an object up and put it back, without and with compensation, land; abort: one "
-        "perch after the other, each aborted in another state; gust: a perch in gusts; world: no script, your own "
-        "ground station flies",
+        "perch after the other, each aborted in another state; gust: a perch in gusts; reach: the tip to five "
+        "points around the vehicle; world: no script, your own ground station flies",
     )
     add_config_arguments(
         parser, default="sim.toml, or the scenario's own: sim_hang.toml, sim_grasp.toml, sim_gust.toml"
@@ -323,7 +324,7 @@ def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[st
         "wall_s": round(wall_s, 3),
         "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
     }
-    further = {"grasp": _grasp_summary, "abort": _abort_summary}.get(scenario, lambda _: {})
+    further = {"grasp": _grasp_summary, "abort": _abort_summary, "reach": _reach_summary}.get(scenario, lambda _: {})
     return contract | further(verdict)
 
 
@@ -332,6 +333,21 @@ def _abort_summary(verdict: Any) -> dict[str, Any]:
     return {
         "aborts": [
             {"state": a.state, "let_go_s": _number(a.let_go_s), "sank_m": _number(a.sank_m)} for a in verdict.aborts
+        ]
+    }
+
+
+def _reach_summary(verdict: Any) -> dict[str, Any]:
+    """What a flight to points has besides."""
+    return {
+        "points": [
+            {
+                "asked_m": list(p.asked_w),
+                "off_m": _number(p.off_m),
+                "worst_m": _number(p.worst_m),
+                "seconds": _number(p.took_s),
+            }
+            for p in verdict.points
         ]
     }
 

@@ -1,5 +1,6 @@
 """One picture of a flight: where it went, what the tendons did, what the arm put on the airframe."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,8 @@ def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
         _draw_position(axes[0], flight, config, start)
         if config.sim.object.mass_kg:
             _draw_load(axes[1], flight, config, start)
+        elif flight.places:
+            _draw_tip(axes[1], flight, start)
         else:
             _draw_moves(axes[1], flight, start)
         _draw_tendons(axes[2], flight, config, start)
@@ -94,6 +97,16 @@ def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
             if asked:
                 axis.plot([mark.start - start, mark.end - start], [1e3 * asked] * 2, color=colour, lw=3, alpha=0.35)
     axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+
+
+def _draw_tip(axis: Axes, flight: Flight, start: float) -> None:
+    """How far the tip is from the point at which it is to be kept."""
+    for place in flight.places:
+        samples = flight.within(place.start, place.end)
+        off = [1e3 * math.dist(s.truth.tip_position_w, place.asked_w) for s in samples]
+        axis.plot([s.t - start for s in samples], off, color=_INK, lw=1.0)
+    axis.set_ylim(bottom=0.0)
+    axis.set_ylabel("tip off its\npoint, mm")
 
 
 def _draw_load(axis: Axes, flight: Flight, config: Config, start: float) -> None:

@@ -9,6 +9,8 @@ Vec3 = tuple[float, float, float]
 
 WITH, WITHOUT, CARRIED = "grasp", "grasp, not compensated", "carried"
 """Names of the marks of a grasp."""
+AT_POINT = "at a point"
+"""Name of the marks at which the tip was kept in one place."""
 
 _ASKED_FOR_S = 0.2  # a set-point older than that is asked no more
 
@@ -74,6 +76,11 @@ class Flight:
             return []
         times = [t for t, _ in self.states[1:]] + [self.end]
         return [(name, start, end) for (start, name), end in zip(self.states, times, strict=True)]
+
+    @property
+    def places(self) -> list[Mark]:
+        """The spans in which the tip was kept at a point."""
+        return [mark for mark in self.marks if mark.name == AT_POINT]
 
     def durations(self) -> list[tuple[str, float]]:
         """Name and length, s, of every state passed."""

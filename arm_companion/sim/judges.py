@@ -11,6 +11,7 @@ from arm_companion.sim.grasp_verdict import judge_grasp
 from arm_companion.sim.hang_verdict import judge_hang
 from arm_companion.sim.mishaps import fly_aborts, fly_in_gusts, fly_one_abort
 from arm_companion.sim.mjcf import GRAVITY
+from arm_companion.sim.reach_scenario import fly_reach, judge_reach
 from arm_companion.sim.scenario import Operator
 from arm_companion.sim.verdict import Verdict, judge
 
@@ -59,6 +60,12 @@ SCENARIOS: Mapping[str, Scenario] = {
         "perched and let go",
         fly_in_gusts,
         lambda flight, failure, _: judge(flight, failure, leaning=True),
+    ),
+    "reach": Scenario(
+        "Reaching points",
+        "every point reached",
+        fly_reach,
+        lambda flight, failure, _: judge_reach(flight, failure),
     ),
     "grasp": Scenario("Grasp", "grasped and put back", Operator.fly_grasp, judge_grasp, Operator.fly_grasp_once),
 }

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from arm_companion.sim.abort_verdict import AbortVerdict
 from arm_companion.sim.grasp_verdict import GraspVerdict
+from arm_companion.sim.reach_scenario import ReachVerdict
 from arm_companion.sim.trials import Outcome, Summary
 from arm_companion.sim.verdict import Verdict
 
@@ -56,6 +57,8 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
         )
     if isinstance(verdict, GraspVerdict):
         _show_grasp(verdict, table)
+    if isinstance(verdict, ReachVerdict):
+        _show_points(verdict, table)
     if isinstance(verdict, AbortVerdict):
         _show_aborts(verdict, table)
     console.print(table)
@@ -73,8 +76,9 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
 def _show_forces(verdict: Verdict, table: Table) -> None:
     """What touched what, and what the daemon predicted of it."""
     mean, most = verdict.contact_force_n
-    table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
-    table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
+    if not isinstance(verdict, ReachVerdict):
+        table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
+        table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
     for wrench in verdict.wrench:
         table.add_row(
             f"wrench on airframe, {wrench.span}",
@@ -104,6 +108,16 @@ def _show_grasp(verdict: GraspVerdict, table: Table) -> None:
             f"error {verdict.mass_error:+.1%}",
         )
     table.add_row("object put down", _mm(verdict.placed_m), "from where it lay")
+
+
+def _show_points(verdict: ReachVerdict, table: Table) -> None:
+    """Where the tip was asked to be, and where it was."""
+    for i, point in enumerate(verdict.points, 1):
+        table.add_row(
+            f"point {i}: {', '.join(f'{x:g}' for x in point.asked_w)} m",
+            f"{_mm(point.off_m)} off",
+            f"median of the tip's distance while kept there, at worst {_mm(point.worst_m)}; took {point.took_s:.1f} s",
+        )
 
 
 def _show_aborts(verdict: AbortVerdict, table: Table) -> None:
