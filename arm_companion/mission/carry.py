@@ -37,6 +37,7 @@ _ABOVE_M = 0.03
 _STEADY_S = 2.5  # until a vehicle that the closing arm has pulled about rests again
 _FOLLOW_S = 0.5
 _TOUCHING_SHARE = 0.7
+_ALONE_SHARE = 0.9  # of the load: with less, something else carries the rest
 _TEST_SHARE = 0.2  # of the lifting speed: the load comes on within millimetres, and the push has to keep up with it
 _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
@@ -147,6 +148,12 @@ def _touching_down(s: Situation) -> bool:
     """Whether some of the load is off, near the height at which it was taken: the push does the rest."""
     load = s.state.load
     return low(s) and load.known and load.now < _TOUCHING_SHARE * load.mass
+
+
+def may_touch(s: Situation) -> bool:
+    """Whether what is carried may touch what it lay on."""
+    load = s.state.load
+    return s.state.phase is Phase.PLACE and (low(s) or load.now < _ALONE_SHARE * load.mass)
 
 
 def push(s: Situation) -> Vec3:

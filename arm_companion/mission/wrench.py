@@ -41,6 +41,7 @@ _WIND_S = 30.0  # and how long it remembers
 _SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides
 _MOMENT_SIGMA = 0.15  # N m, of what the bar passes on besides the force
 _SPREAD = Spread(hold_position=0.005, hold_rotation=0.03)
+_DRAG_SHARE = 0.15  # of the load's weight: what touches its cradle is dragged aside, and swings
 _UPPER = np.triu_indices(6)
 _NAN3: Vec3 = (math.nan, math.nan, math.nan)
 
@@ -243,7 +244,7 @@ def _spread(s: Situation, solution: ArmSolution) -> Spread:
 
 
 def _gripped(found: Reaction, s: Situation, mass: float) -> Reaction:
-    """With what is not known of a load besides its weight: where in the grip it sits.
+    """With what is not known of a load besides its weight: where in the grip it sits, and what it drags along.
 
     Its weight turns about another place then, and so does what is not known of the force: under a vehicle that hovers
     level nothing else turns it about the vertical.
@@ -251,8 +252,12 @@ def _gripped(found: Reaction, s: Situation, mass: float) -> Reaction:
     weight_b = mass * np.asarray(unrotate(s.facts.vehicle.attitude_wb, (0.0, 0.0, GRAVITY)))
     R, place = s.mount.rotation, np.square(carry.grip_sigma_a(s))
     force, torque = found.sigma[:3] ** 2, found.sigma[3:] ** 2
+    if carry.may_touch(s):
+        drag = (_DRAG_SHARE * s.state.load.mass * GRAVITY) ** 2 * np.array((1.0, 1.0, 0.0))
+        lever = np.square(so3.hat(s.mount.position + R[:, 2] * s.parameters.model.parameters.L))
+        force, torque = force + drag, torque + lever @ drag
     torque = torque + np.square(so3.hat(weight_b) @ R) @ place + np.square(so3.hat(np.sqrt(force))) @ (R**2 @ place)
-    return replace(found, sigma=np.concatenate((found.sigma[:3], np.sqrt(torque))))
+    return replace(found, sigma=np.sqrt(np.concatenate((force, torque))))
 
 
 def _weigh(found: Reaction, s: Situation) -> Reaction:

@@ -18,9 +18,9 @@ from arm_companion.mission.facts import Facts, Vec3, WrenchReport
 from arm_companion.mission.motion import norm, rotate
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import Phase, State
+from arm_companion.mission.state import Anchor, Phase, State
 from arm_companion.mission.wrench import grip
-from tests.unit.mission_rig import BENT, PLACE, T0, gripping, memory, run
+from tests.unit.mission_rig import BENT, PLACE, T0, gripping, memory, moved, run, vehicle
 
 Hovering = Callable[..., Facts]
 
@@ -111,6 +111,28 @@ def test_a_vehicle_that_tilts_to_accelerate_feels_what_hangs_on_it_lag_behind(
     assert world(said[0].wrench, facts) == pytest.approx((-mass * a, 0.0, mass * GRAVITY), abs=0.02)
     _, said = run(after, facts, parameters, 3.0)  # it goes on leaning, and stays where it is: that is wind
     assert world(said[-1].wrench, facts)[0] == pytest.approx(0.0, abs=0.02)
+
+
+def test_a_load_that_is_set_down_may_be_dragged_and_one_in_the_air_is_not(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    x, y, z = PLACE
+    weight, told = 0.2 * GRAVITY, {}
+    share = 0.5 * (1.0 + 0.2 / 1.8 / 1.25)  # of thrust, with which the load is held up
+    load = dataclasses.replace(carrying(0.2).load, flow=Flow(1.0, share, 0.0))
+    for name, phase, up in (("carried", Phase.CARRY, 0.4), ("high", Phase.PLACE, 0.4), ("low", Phase.PLACE, 0.02)):
+        facts = vehicle(thrust=share)(moved((0.0, 0.0, -up))(hovering(BENT)))
+        anchor = Anchor(PLACE, facts.vehicle.attitude_wb, (4.0,) * 4)
+        state = memory(phase, load=load, position=(x, y, z - up), anchor=anchor)
+        _, said = run(state, facts, parameters)
+        told[name] = said[0].wrench
+    for name in ("carried", "high"):
+        assert max(told[name].force_sigma[:2]) < 0.05 * weight, name
+    low = told["low"]
+    assert min(low.force_sigma[:2]) > 0.15 * weight
+    assert low.force_sigma[2] == pytest.approx(told["high"].force_sigma[2], rel=0.05), "its weight is as it was"
+    assert low.torque_sigma[1] > told["high"].torque_sigma[1] + 0.15 * weight * 0.2, "by a lever of arm and mount"
+    assert low.force_b == pytest.approx(told["high"].force_b, abs=0.02)
 
 
 @pytest.mark.parametrize("gripper", [False, True])
