@@ -121,22 +121,29 @@ def files_of(file: str | Path) -> list[Path]:
         found.append(path)
         try:
             base = tomllib.loads(path.read_text(encoding="utf-8")).get(_EXTENDS)
-            path = locate(path.parent / base) if isinstance(base, str) else None
+            path = _base(path, base) if isinstance(base, str) else None
         except (ConfigError, OSError, ValueError):  # TOML and UTF-8 errors are ValueErrors
             path = None
     return found + after
 
 
-def locate(file: str | Path) -> Path:
+def locate(file: str | Path, *, plain: bool = False) -> Path:
     """The file itself, or the shipped one of that name.
+
+    Args:
+        file: a path; a bare name, or one in a folder `configs`, may be that of a shipped file.
+        plain: it was given as a bare name.
 
     Raises:
         ConfigError: when there is neither.
     """
     path = Path(file)
-    if path.is_file():
-        return path
-    if path.name == str(file) or path.parent.name == "configs":
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a folder that this user may not look into
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
+    if plain or path.name == str(file) or path.parent.name == "configs":
         for folder in shipped():
             if (folder / path.name).is_file():
                 return folder / path.name
@@ -218,7 +225,12 @@ def _with_bases(path: Path, seen: tuple[Path, ...]) -> list[Layer]:
         return [layer]
     if not isinstance(base, str):
         raise ConfigError(f"{path.name}: {_EXTENDS} = {base!r} is not allowed: a file name")
-    return [*_with_bases(locate(path.parent / base), (*seen, path)), layer]
+    return [*_with_bases(_base(path, base), (*seen, path)), layer]
+
+
+def _base(path: Path, name: str) -> Path:
+    """The file that `path` extends: beside it, or else the shipped one of that name, wherever `path` is."""
+    return locate(path.parent / name, plain=Path(name).name == name)
 
 
 def _read(path: Path, name: str, *, may_extend: bool = False) -> Layer:

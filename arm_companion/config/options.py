@@ -21,6 +21,7 @@ Source = Callable[[str], str]
 """Who gave the value of a dotted key: a file, a variable, a setting."""
 
 _META = "option"
+_LARGEST = 2**63
 
 
 @dataclass(frozen=True)
@@ -167,11 +168,14 @@ def _convert(hint: Any, value: Any, meta: Option, source: Source, key: str) -> A
 
 
 def _scalar(hint: Any, value: Any, meta: Option, source: Source, key: str) -> Any:
+    if isinstance(value, int) and abs(value) > _LARGEST:  # TOML's whole numbers have no end, floats have
+        raise _refusal(source, key, value, meta.allowed())
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if type(value) is not hint:
         names = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
-        raise _refusal(source, key, value, f"{names.get(hint, str(hint))} ({meta.allowed()})")
+        range_ = f" ({meta.allowed()})" if hint in (float, int) or meta.choices else ""
+        raise _refusal(source, key, value, names.get(hint, str(hint)) + range_)
     if isinstance(value, str):
         if meta.choices and value not in meta.choices:
             raise _refusal(source, key, value, meta.allowed())

@@ -169,14 +169,18 @@ def overlay(config: Config, values: Mapping[str, float]) -> tuple[Config, list[s
     Returns:
         The configuration, and in words what no longer fits and was left as the files say.
     """
-    complaints = []
     known = {parameter.path: parameter for parameter in PARAMETERS}
-    for path, value in values.items():
-        if path not in known:
-            complaints.append(f"{path} is no parameter")
-            continue
-        try:
-            config = known[path].write(config, value)
-        except ConfigError as error:
-            complaints.append(str(error))
+    complaints = [f"{path} is no parameter" for path in values if path not in known]
+    left = {path: value for path, value in values.items() if path in known}
+    # A value may fit only after another of them, as a lower limit does after what it limits: try until nothing moves.
+    while left:
+        refused = {}
+        for path, value in left.items():
+            try:
+                config = known[path].write(config, value)
+            except ConfigError as error:
+                refused[path] = str(error)
+        if len(refused) == len(left):
+            return config, [*complaints, *refused.values()]
+        left = {path: left[path] for path in refused}
     return config, complaints

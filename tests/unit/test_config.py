@@ -77,6 +77,20 @@ def test_a_setting_that_makes_no_sense_is_refused(setting: str) -> None:
         load("zhao2022.toml", [setting])
 
 
+@pytest.mark.parametrize("key", ["perch.bar_radius_m", "vehicle.component_id", "mount.position_m"])
+def test_a_whole_number_without_end_is_refused(key: str) -> None:
+    huge = "1" + 400 * "0"
+    with pytest.raises(ConfigError, match=key):
+        load("zhao2022.toml", [f"{key}={huge if key != 'mount.position_m' else [0, 0, int(huge)]}"])
+
+
+@pytest.mark.parametrize(("setting", "end"), [("mqtt.vehicle=7", "a string"), ("mqtt.tls=1", "true or false")])
+def test_a_refusal_names_a_range_only_where_there_is_one(setting: str, end: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load("zhao2022.toml", [setting])
+    assert str(caught.value).endswith(f"is not allowed: {end}")
+
+
 def test_a_configuration_cannot_be_changed() -> None:
     config = load("zhao2022.toml")
     with pytest.raises(dataclasses.FrozenInstanceError):

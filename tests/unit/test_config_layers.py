@@ -208,6 +208,23 @@ def test_check_lists_the_layers_and_says_what_cannot_fly(file: Path, capsys: pyt
     assert capsys.readouterr().out.strip().endswith("sim.toml: usable")
 
 
+def test_a_file_anywhere_extends_one_that_comes_with_the_package(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('extends = "zhao2022.toml"\n[vehicle]\nmass_kg = 2.0\n')
+    assert load(tmp_path / "mine.toml").vehicle.mass_kg == 2.0
+    assert [path.name for path in files_of(tmp_path / "mine.toml")] == ["mine.toml", "zhao2022.toml"]
+    (tmp_path / "zhao2022.toml").write_text("[arm]\ndisks = 7\n")  # one beside it comes first
+    assert load(tmp_path / "mine.toml").arm.disks == 7
+
+
+def test_a_folder_that_nobody_may_look_into_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def closed(_: Path) -> bool:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(Path, "is_file", closed)
+    with pytest.raises(ConfigError, match=r"/closed/config\.toml: cannot be read: Permission denied"):
+        load("/closed/config.toml")
+
+
 def test_the_environment_reaches_the_command(file: Path) -> None:
     words = [sys.executable, "-m", "arm_companion", "config", "show", "--config", str(file)]
     environment = {f"{PREFIX}VEHICLE__MASS_KG": "3.25", "PYTHONPATH": str(ROOT)}

@@ -149,6 +149,18 @@ def test_kept_values_that_no_longer_fit_are_left_out() -> None:
     assert len(complaints) == 2
 
 
+def test_a_limit_that_was_lowered_after_what_it_limits_is_kept() -> None:
+    """The file is sorted, so that the limit comes before the value that has to make room for it."""
+    settings = Settings(Config())
+    settings.set(BY_NAME["PERCH_WRAP_BEND"], 3.0)
+    settings.set(BY_NAME["LIM_BEND"], 3.5)
+    config, complaints = overlay(Config(), {"limits.bend_max_rad": 3.5, "perch.wrap_bend_rad": 3.0})
+    assert (config.limits.bend_max_rad, config.perch.wrap_bend_rad) == (3.5, 3.0)
+    assert not complaints
+    _, complaints = overlay(Config(), {"limits.bend_max_rad": 3.5})
+    assert len(complaints) == 1
+
+
 def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / FILE
     write_atomically(file, b"old")
