@@ -4,6 +4,7 @@ Type, unit, bounds and meaning come from the schema. The table is what MAVLink d
 characters, in one order, while the daemon runs.
 """
 
+import ctypes
 import dataclasses
 import enum
 import functools
@@ -17,7 +18,6 @@ from arm_companion.config.schema import Config
 from arm_companion.errors import ConfigError
 
 NAME_LENGTH: Final = 16
-_DIGITS: Final = 7  # that a float of 32 bits carries
 
 
 class When(enum.Enum):
@@ -68,7 +68,7 @@ class Parameter:
             ConfigError: the value is not finite, out of bounds or not whole, or does not go with other options.
         """
         option = self.option
-        number: float = round(value) if self.whole and abs(value) < 2**31 else float(f"{value:.{_DIGITS}g}")
+        number: float = round(value) if self.whole and abs(value) < 2**31 else _decimal(value)
         if not option.lower <= number <= option.upper or (self.whole and number != value):
             kind = "a whole number, " if self.whole else ""
             raise ConfigError(f"{self.name} = {value:g} is not allowed: {kind}{option.allowed()}")
@@ -79,6 +79,13 @@ class Parameter:
             entries[self.entry] = number
             new = tuple(entries)
         return dataclasses.replace(config, **{self.section: dataclasses.replace(section, **{self.key: new})})
+
+
+def _decimal(value: float) -> float:
+    """The shortest decimal that is the same float of 32 bits, as which it travels: 0.1 comes as 0.10000000149."""
+    same = ctypes.c_float(value).value
+    shorter = (float(f"{value:.{digits}g}") for digits in (7, 8))
+    return next((number for number in shorter if ctypes.c_float(number).value == same), value)
 
 
 @functools.cache

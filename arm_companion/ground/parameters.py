@@ -126,13 +126,15 @@ class ParameterClient:
         async with self._values() as values:
             for _ in range(TRIES):
                 await self._channel.send(mav.MAVLink_param_set_message, name.encode("ascii"), raw, type_)
-                if (after := await _next(values, name)) is not None:
+                while (heard := await _next(values, name)) is not None:
+                    after = heard  # another value may be a late answer to `read`: wait for what comes after it
+                    if _is(after, raw):
+                        return after
+                if after is not None:
                     break
         if after is None:
             raise ArmSilent(f"no answer to setting {name}; it was {before.value:g}")
-        if math.isnan(after.value) or _encode(after, after.value)[1] != raw:
-            raise ParameterRefused(f"{name} stays {after.value:g}: the arm did not take {value:g}")
-        return after
+        raise ParameterRefused(f"{name} stays {after.value:g}: the arm did not take {value:g}")
 
     async def _collect(
         self,
@@ -178,6 +180,11 @@ async def _next(values: "asyncio.Queue[Parameter]", name: str) -> Parameter | No
     except TimeoutError:
         return None
     return parameter
+
+
+def _is(parameter: Parameter, raw: float) -> bool:
+    """Whether the value's four bytes are those of `raw`."""
+    return not math.isnan(parameter.value) and _encode(parameter, parameter.value)[1] == raw
 
 
 def _check(name: str) -> None:

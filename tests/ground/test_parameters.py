@@ -1,5 +1,6 @@
 """The parameter protocol's client against a scripted service that loses and refuses."""
 
+import asyncio
 import struct
 from typing import Any
 
@@ -118,6 +119,18 @@ def test_what_does_not_fit_is_refused_in_words(scripted: Any, name: str, value: 
 
     scripted.run(main)
     assert service.values == before
+
+
+def test_a_late_answer_to_an_earlier_question_is_no_refusal(scripted: Any) -> None:
+    """A radio with 0.9 s to and fro: reading is asked twice, and the second answer comes after the value was set."""
+    service = Service(scripted)
+    answer = service.take
+    scripted.script = lambda message: asyncio.get_running_loop().call_later(0.9, answer, message)
+
+    async def main() -> None:
+        assert (await scripted.arm.parameters.write("P3", 7.0)).value == 7.0
+
+    scripted.run(main)
 
 
 KINDS = {"uint8": (0, 255), "int8": (-128, 127), "uint16": (0, 65535), "int16": (-32768, 32767)}

@@ -257,6 +257,19 @@ def test_a_change_is_answered_with_the_new_value_and_a_refusal_with_the_old_one(
     serve(body)
 
 
+def test_what_is_answered_is_what_was_set_to_the_last_bit() -> None:
+    """A ground station compares: 60 degrees in rad need more than seven digits."""
+    sixty = struct.unpack("<f", struct.pack("<f", math.radians(60.0)))[0]
+
+    async def body(rig: ServiceRig) -> None:
+        rig.ground.send(parameter_set("PERCH_WRAP_BEND", sixty), parameter_set("PERCH_STANDOFF", 0.8))
+        await soon()
+        assert rig.ground.all("PARAM_VALUE")[0].param_value == sixty
+        assert rig.settings.config.perch.standoff_m == 0.8
+
+    serve(body)
+
+
 def test_a_stranger_reads_but_does_not_change() -> None:
     async def body(rig: ServiceRig) -> None:
         rig.ground.send(parameter_set("PERCH_STANDOFF", 0.75))
