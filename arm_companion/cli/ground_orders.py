@@ -19,10 +19,10 @@ from arm_companion.ground.commands import CommandFailed
 from arm_companion.ground.jog import HELP, PERIOD_S, WATCHDOG_S, Jog, keyboard
 from arm_companion.ground.parameters import Parameter
 from arm_companion.ground.reports import Status
+from arm_companion.ground.targets import tell_bar, tell_object
 from arm_companion.ground.texts import Text
 from arm_companion.protocol.dialect import mav
 
-_TARGET_S: Final = 1.5
 _FOLLOWS_S: Final = 2.0
 _STILL: Final = math.radians(1.0)
 _STATUS_S: Final = 0.3
@@ -135,47 +135,18 @@ def _order(name: str) -> Action:
             heading = math.radians(arguments.bar_axis_deg)
             axis = (math.cos(heading), math.sin(heading), 0.0)
             north, east, down = arguments.bar
-            await _target(arm, arm.target_bar((north, east, down), axis, arguments.bar_radius), flag=True)
+            await tell_bar(arm, (north, east, down), axis, arguments.bar_radius)
         if name == "perch" and arguments.hang:
             hang = arm.perch(mav.ARM_PERCH_KIND_HANG, progress=progress, timeout=arguments.timeout)
             return await follow(arguments, arm, "PERCH", hang)
         if name == "grasp" and arguments.object is not None:
             heading = math.radians(arguments.object_axis_deg)
             north, east, down = arguments.object
-            await _target(arm, arm.target_object((north, east, down), heading, arguments.object_radius), flag=False)
+            await tell_object(arm, (north, east, down), heading, arguments.object_radius)
         method: Callable[..., Awaitable[None]] = getattr(arm, name)
         return await follow(arguments, arm, name.upper(), method(progress=progress, timeout=arguments.timeout))
 
     return action
-
-
-async def _target(arm: Arm, tell_target: Awaitable[None], *, flag: bool) -> None:
-    """Tell where bar or object is, and see it taken.
-
-    Args:
-        arm: that is told.
-        tell_target: sends it.
-        flag: whether the arm shows that it knows it before it is ordered there, as it does of a bar.
-
-    Raises:
-        ArmError: it is refused, or nothing shows that it has been taken.
-    """
-    said = len(arm.texts)
-    await tell_target
-
-    def refusal() -> str:
-        return next((t.text for t in list(arm.texts)[said:] if t.text.startswith("target refused")), "")
-
-    def answered() -> bool:
-        return bool(refusal()) or (arm.status is not None and "target_known" in arm.status.flags)
-
-    # A refusal comes at once; the flag may be that of an earlier target, so that a refusal is waited for anyway.
-    with contextlib.suppress(ArmSilent):
-        await arm.channel.wait_for(lambda: bool(refusal()), 0.5, "")
-    if flag:
-        await arm.channel.wait_for(answered, _TARGET_S, "the arm does not show that it has taken the bar")
-    if refusal():
-        raise ArmError(refusal())
 
 
 async def _jog(arguments: argparse.Namespace, arm: Arm) -> int:

@@ -42,12 +42,17 @@ def access(subject: Subject) -> Outcome:
     config = subject.config
     if config is None:
         return no_config(subject)
-    grounds = [name for name, link in config.links.items() if link.role == "ground"]
-    unsigned = [name for name in grounds if not config.links[name].signing_key]
+    # ground stations come through the autopilot too; a peer may command only when it is named
+    unsigned = [
+        name
+        for name, link in config.links.items()
+        if link.role != "peer" and (not link.signing_key or link.unsigned == "accept")
+    ]
     if unsigned and not config.vehicle.commanders:
         return warn(
             f"whoever reaches link {', '.join(unsigned)} may command the arm",
-            "name the ground station in vehicle.commanders, or give the link a signing_key",
+            "name the ground station in vehicle.commanders, or give the link a signing_key that unsigned frames do "
+            "not get around",
         )
     who = ", ".join(map(str, config.vehicle.commanders)) or "whoever signs"
     return ok(f"commands are taken from: {who}")

@@ -105,6 +105,7 @@ class Component:
         self._general = (uri(vehicle.component_id, GENERAL).encode(), crc32(files[GENERAL]))
         self.services.offer(mav.MAVLINK_MSG_ID_COMPONENT_INFORMATION_BASIC, lambda _: self._information())
         self.services.offer(mav.MAVLINK_MSG_ID_COMPONENT_METADATA, lambda _: self._metadata())
+        self.services.offer(mav.MAVLINK_MSG_ID_ARM_TARGET, self.guidance.told)
         for link in links:
             link.streams.offer(HEARTBEAT, 1.0 / HEARTBEAT_PERIOD_S, fixed=True)
             link.subscribe_open(self._beat)

@@ -54,6 +54,7 @@ class Guidance:
         self._clock = clock
         self._complained = float("-inf")
         self._newest: dict[tuple[int, int, int, int], float] = {}  # stamp by sender, message and kind
+        self._told: dict[float, Message] = {}  # the newest target that was taken, by kind
         self._new_bar: Bar | None = None
         self._bar_at = self._object_at = self._setpoint_at = float("-inf")
         self._object: GraspTarget | None = None
@@ -63,6 +64,13 @@ class Guidance:
         """The newest bar that has come since the last call."""
         bar, self._new_bar = self._new_bar, None
         return bar
+
+    def told(self, kind: float) -> Message | None:
+        """The newest target of a kind as it was taken, for who wants to know whether his own has come; None before."""
+        target = self._told.get(kind)
+        if target is None:
+            return None
+        return mav.MAVLink_arm_target_message(0, 0, *(getattr(target, name) for name in target.fieldnames[2:]))
 
     @property
     def bar_age_s(self) -> float:
@@ -127,6 +135,7 @@ class Guidance:
             self._object, self._object_at = thing, at
         else:
             raise CommandRejected(f"targets of kind {message.kind} are not known")
+        self._told[message.kind] = message
         return True
 
     def _take_setpoint(self, message: Message) -> bool:

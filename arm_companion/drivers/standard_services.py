@@ -16,8 +16,8 @@ from arm_companion.protocol.mavlink import Message
 
 log = logging.getLogger(__name__)
 
-Maker = Callable[[MavlinkLink], Message]
-"""Makes a message for whoever asks on a link."""
+Maker = Callable[[float], Message | None]
+"""Makes a message for whoever asks, of what REQUEST_MESSAGE's param2 names; None: there is none of it."""
 
 _INTERVAL: Final = mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL
 
@@ -69,7 +69,9 @@ class StandardServices:
         if id_ == _INTERVAL:
             return self._send_interval(about, link)
         if id_ in self._makers:
-            link.send(self._makers[id_](link))
+            if (message := self._makers[id_](about)) is None:
+                return self._commands.reject_for_now(command, link, "there is nothing to tell yet")
+            link.send(message)
         elif not link.streams.ask(id_):
             return int(mav.MAV_RESULT_UNSUPPORTED)
         return int(mav.MAV_RESULT_ACCEPTED)

@@ -35,6 +35,7 @@ HEARD: Final = (
     "ARM_TENDONS",
     "ARM_STIFFNESS",
     "ARM_PAYLOAD",
+    "ARM_TARGET",
 )
 """What is asked of MAVSDK; the rest of a vehicle's traffic never reaches Python."""
 

@@ -58,6 +58,24 @@ def test_a_bar_comes_with_its_uncertainty_and_age() -> None:
     serve(body)
 
 
+def test_whoever_told_a_target_can_ask_whether_it_was_taken() -> None:
+    async def body(rig: ServiceRig) -> None:
+        ask = (mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_ARM_TARGET)
+        rig.ground.command(*ask, mav.ARM_TARGET_KIND_BAR)
+        await soon()
+        assert rig.ground.all("ARM_TARGET") == []
+        assert "temporarily rejected: there is nothing to tell yet" in rig.words()
+        rig.ground.send(target(position=[1.0, 2.0, -3.0]), target(kind=1, q=[NAN] * 4), target(radius=-1.0))
+        await soon()
+        rig.ground.command(*ask, mav.ARM_TARGET_KIND_BAR)
+        await soon()
+        (told,) = rig.ground.all("ARM_TARGET")
+        assert (told.kind, told.position, told.target_system) == (0, [1.0, 2.0, -3.0], 0)
+        assert told.radius > 0.0
+
+    serve(body)
+
+
 def test_what_is_not_told_is_none() -> None:
     async def body(rig: ServiceRig) -> None:
         rig.ground.send(target(position_covariance=[0.0] * 6, direction_sigma=0.0))
