@@ -152,7 +152,8 @@ def test_where_nothing_is_wrong_every_check_is_well_and_has_its_reason(subject: 
          "numpy 1.20.0 is older than 1.26"),
         ("versions", {"machine": {"version": {"numpy": "2.0"}.get}}, Level.FAIL, "fastcrc is missing"),
         ("access", {"config": dataclasses.replace(CONFIG, links={
-            "autopilot": AUTOPILOT, "ground": LinkConfig("udpin:127.0.0.1:1", "ground")})}, Level.WARN, "autopilot, ground"),
+            "autopilot": AUTOPILOT, "ground": LinkConfig("udpin:127.0.0.1:1", "ground")})}, Level.WARN,
+         "autopilot, ground"),
         # ground stations come through the autopilot's link too, and a key that unsigned frames get around is none
         ("access", {"config": dataclasses.replace(CONFIG, links={"autopilot": AUTOPILOT})}, Level.WARN,
          "link autopilot"),

@@ -70,7 +70,7 @@ def test_whoever_told_a_target_can_ask_whether_it_was_taken() -> None:
         rig.ground.command(*ask, mav.ARM_TARGET_KIND_BAR)
         await soon()
         (told,) = rig.ground.all("ARM_TARGET")
-        assert (told.kind, told.position, told.target_system) == (0, [1.0, 2.0, -3.0], 0)
+        assert (told.kind, tuple(told.position), told.target_system) == (0, (1.0, 2.0, -3.0), 0)
         assert told.radius > 0.0
 
     serve(body)
