@@ -54,7 +54,7 @@ async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Await
     listener = asyncio.create_task(_repeat_texts(arguments, arm))
     try:
         async with interrupts() as queue:
-            presses = await _until_done_or_left(arguments, arm, name, task, queue)
+            aborted = await _until_done_or_left(arguments, arm, name, task, queue)
     finally:
         listener.cancel()
         task.cancel()  # does nothing to one that is done
@@ -72,7 +72,7 @@ async def follow(arguments: argparse.Namespace, arm: Arm, name: str, work: Await
     except CommandFailed as failed:
         print(f"arm-companion ground: {failed}", file=sys.stderr)
         tell(arguments, result=failed.result, reason=failed.reason, **facts)
-        return INTERRUPTED if presses else FAILED
+        return INTERRUPTED if aborted else FAILED
     say(arguments, f"{name} done in {seconds:.1f} s" + (f", state {state}" if state else ""))
     tell(arguments, result="accepted", reason="", **facts)
     return DONE
@@ -88,8 +88,8 @@ async def _fresh_status(arm: Arm) -> None:
 
 async def _until_done_or_left(
     arguments: argparse.Namespace, arm: Arm, name: str, task: "asyncio.Future[None]", interrupted: "asyncio.Queue[int]"
-) -> int:
-    """Wait for the order, or for the Ctrl-C that leaves; returns how often it was pressed."""
+) -> bool:
+    """Wait for the order, or for the Ctrl-C that leaves; returns whether one has aborted it."""
     presses = 0
     abort: asyncio.Task[None] | None = None
     while not task.done() and presses < _LEAVE:
@@ -109,7 +109,7 @@ async def _until_done_or_left(
         if presses >= _LEAVE:
             abort.cancel()
         await asyncio.wait({abort})
-    return presses
+    return abort is not None
 
 
 async def _abort(arguments: argparse.Namespace, arm: Arm) -> None:
@@ -197,7 +197,8 @@ async def _jog_by_keys(arguments: argparse.Namespace, arm: Arm, status: Status) 
 
 def _show_jog(arguments: argparse.Namespace, jog: Jog, now: Status) -> None:
     if arguments.json:
-        tell(arguments, theta=jog.theta, delta=jog.delta, arm_theta=now.theta, arm_delta=now.delta)
+        arm_theta, arm_delta = (value if math.isfinite(value) else None for value in (now.theta, now.delta))
+        tell(arguments, theta=jog.theta, delta=jog.delta, arm_theta=arm_theta, arm_delta=arm_delta)
         return
     asked = f"asked {math.degrees(jog.theta):6.1f} deg in {math.degrees(jog.delta):6.1f}"
     is_at = f"at {math.degrees(now.theta):6.1f} in {math.degrees(now.delta):6.1f}"

@@ -50,7 +50,7 @@ class Jog:
 
         Args:
             key: `up`, `down`, `left`, `right`, `0`, ` `, `+` or `-`; others change nothing.
-            theta: where the arm is now, rad, for holding it there.
+            theta: where the arm is now, rad, for holding it there; NaN: not known, then it holds where it was asked to be.
             delta: its plane, rad.
         """
         match key:
@@ -63,7 +63,7 @@ class Jog:
                 return Jog(self.theta, math.remainder(self.delta + turn, math.tau), self.step)
             case "0":
                 return Jog(0.0, self.delta, self.step)
-            case " ":
+            case " " if math.isfinite(theta) and math.isfinite(delta):
                 return Jog(theta, delta, self.step)
             case "+" | "-":
                 return Jog(self.theta, self.delta, min(max(self.step + (1 if key == "+" else -1), 0), len(_STEPS) - 1))

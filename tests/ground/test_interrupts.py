@@ -89,6 +89,24 @@ def test_once_only_tells_how_to_stop_the_arm(
     assert "PERCH goes on. Ctrl-C again: abort" in said
 
 
+def test_an_order_that_fails_by_itself_after_one_press_has_failed(
+    scripted: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ground_orders, "interrupts", Keys(0.2).interrupts)
+
+    def fail() -> None:
+        scripted.text("PERCH failed: no contact")
+        scripted.ack(PERCH, mav.MAV_RESULT_FAILED)
+
+    async def main() -> int:
+        scripted.script = lambda _: asyncio.get_running_loop().call_later(0.5, fail)
+        arguments = argparse.Namespace(action="perch", json=True, timeout=None, bar=None, hang=False)
+        return await ground_orders.ACTIONS["perch"](arguments, scripted.arm)
+
+    assert scripted.run(main) == 1
+    assert result(capsys)[:2] == ("failed", "no contact")
+
+
 def test_twice_aborts_and_waits_for_the_arms_word(
     scripted: Any, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 
 from arm_companion.cli import ground_orders
-from arm_companion.ground.jog import PERIOD_S, WATCHDOG_S, keyboard
+from arm_companion.ground.jog import PERIOD_S, WATCHDOG_S, Jog, keyboard
+from arm_companion.ground.reports import Status
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 
@@ -141,3 +142,13 @@ def test_the_keyboard_gives_keys_without_echo_and_puts_the_terminal_back(monkeyp
     finally:
         os.close(terminal)
         os.close(master)
+
+
+def test_an_arm_that_does_not_know_its_bend_is_held_and_told_as_json(
+    make_status: Make, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = Jog(0.5, 0.25)
+    assert asked.press(" ", math.nan, math.nan) == asked
+    arguments = argparse.Namespace(json=True)
+    ground_orders._show_jog(arguments, asked, Status.of(make_status("READY", theta=math.nan)))
+    assert '"arm_theta": null' in capsys.readouterr().out
