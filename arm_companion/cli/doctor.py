@@ -28,7 +28,12 @@ from arm_companion.transport.urls import open_bus, open_url
 
 CHECKS: Final = (*config_checks.CHECKS, *vehicle_checks.CHECKS, *arm_checks.CHECKS, *machine_checks.CHECKS)
 _CODES: Final = {Level.FAIL: 2, Level.WARN: 1}
-_SERVICE_CACHE: Final = Path("/var/cache/arm-companion")  # the unit's NUMBA_CACHE_DIR
+_SERVICE: Final = {
+    "NUMBA_CACHE_DIR": Path("/var/cache/arm-companion"),
+    "STATE_DIRECTORY": Path("/var/lib/arm-companion"),
+}
+"""Variables that the unit, or systemd for it, sets: where mechanics, changed parameters and time stamps are."""
+
 _TIME_ERROR: Final = 5  # adjtimex: the clock is not synchronised
 _TIMEX_BYTES: Final = 1024  # more than struct timex of any machine
 
@@ -71,6 +76,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def look(arguments: argparse.Namespace, computer: Machine) -> Subject:
     """All that the checks see."""
+    as_the_service()
     try:
         config = with_kept_changes(load_from(arguments))
     except ConfigError as error:
@@ -129,10 +135,14 @@ def _version(package: str) -> str | None:
         return None
 
 
+def as_the_service() -> None:
+    """Look where the service looks, where it is installed, unless the environment names another place."""
+    for name, directory in _SERVICE.items():
+        if directory.is_dir():
+            os.environ.setdefault(name, str(directory))
+
+
 def _mechanics() -> str:
-    """Where the service would find them, unless the environment names another place."""
-    if _SERVICE_CACHE.is_dir():
-        os.environ.setdefault("NUMBA_CACHE_DIR", str(_SERVICE_CACHE))
     return compiled.load(compiling=False)
 
 

@@ -50,7 +50,7 @@ class Jog:
 
         Args:
             key: `up`, `down`, `left`, `right`, `0`, ` `, `+` or `-`; others change nothing.
-            theta: where the arm is now, rad, for holding it there; NaN: not known, then it holds where it was asked to be.
+            theta: where the arm is now, rad, for holding it there; where it is not known, this changes nothing.
             delta: its plane, rad.
         """
         match key:

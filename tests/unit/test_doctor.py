@@ -276,6 +276,19 @@ def quiet_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+def test_the_parameters_that_the_service_has_kept_are_in_force(
+    quiet_machine: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nobody at a prompt has the variable that systemd sets for the service."""
+    monkeypatch.setattr(os, "environ", {k: v for k, v in os.environ.items() if k != "STATE_DIRECTORY"})
+    monkeypatch.setitem(command._SERVICE, "STATE_DIRECTORY", tmp_path)
+    (tmp_path / "parameters.json").write_text('{"perch.wrap_bend_rad": 3.0}', encoding="utf-8")
+    arguments = argparse.Namespace(config="sim.toml", settings=[], offline=True)
+    seen = command.look(arguments, machine(tmp_path))
+    assert seen.config is not None
+    assert seen.config.perch.wrap_bend_rad == 3.0
+
+
 def test_while_the_daemon_runs_nothing_is_opened(
     quiet_machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
