@@ -2,12 +2,14 @@
 
 import argparse
 import asyncio
+import contextlib
 import ctypes
 import ctypes.util
 import json
 import os
+import pwd
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Final
@@ -16,6 +18,7 @@ from arm_companion import __version__
 from arm_companion.arm import compiled
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.clock import Clock, precise_loop, unix_now
+from arm_companion.config.layers import SYSTEM_FILE
 from arm_companion.config.schema import Config
 from arm_companion.doctor import arm_checks, config_checks, machine_checks, report, vehicle_checks
 from arm_companion.doctor.check import Finding, Level, examine
@@ -28,6 +31,7 @@ from arm_companion.transport.urls import open_bus, open_url
 
 CHECKS: Final = (*config_checks.CHECKS, *vehicle_checks.CHECKS, *arm_checks.CHECKS, *machine_checks.CHECKS)
 _CODES: Final = {Level.FAIL: 2, Level.WARN: 1}
+_USER: Final = "arm-companion"
 _SERVICE: Final = {
     "NUMBA_CACHE_DIR": Path("/var/cache/arm-companion"),
     "STATE_DIRECTORY": Path("/var/lib/arm-companion"),
@@ -61,8 +65,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Look at everything; the exit code is that of the gravest finding."""
-    subject = look(arguments, machine())
-    findings = examine(CHECKS, subject)
+    with eyes_of_the_service(arguments.config):
+        subject = look(arguments, machine())
+        findings = examine(CHECKS, subject)
     if arguments.json:
         print(json.dumps(_summary(findings), indent=2))
     else:
@@ -133,6 +138,28 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+@contextlib.contextmanager
+def eyes_of_the_service(file: str) -> Iterator[None]:
+    """Root, who may do everything, looks at the service's configuration with the rights of the service's user."""
+    try:
+        user = pwd.getpwnam(_USER)
+    except KeyError:
+        user = None
+    if user is None or os.geteuid() != 0 or Path(file) != SYSTEM_FILE:
+        yield
+        return
+    group, groups = os.getegid(), os.getgroups()
+    os.setgroups(os.getgrouplist(user.pw_name, user.pw_gid))
+    os.setegid(user.pw_gid)
+    os.seteuid(user.pw_uid)
+    try:
+        yield
+    finally:
+        os.seteuid(0)
+        os.setegid(group)
+        os.setgroups(groups)
 
 
 def as_the_service() -> None:

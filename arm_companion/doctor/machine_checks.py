@@ -107,11 +107,13 @@ def disk(subject: Subject) -> Iterator[Outcome]:
     for what, directory in wanted.items():
         standing = _standing(directory)
         free = subject.machine.free_bytes(standing)
-        if standing != directory and not os.access(standing, os.W_OK):
+        writable = os.access(standing, os.W_OK, effective_ids=True)
+        if standing != directory and not writable:
             yield fail(f"{what}: {directory} does not exist and cannot be made", f"make {directory}")
-        elif standing == directory and not os.access(standing, os.W_OK):
+        elif standing == directory and not writable:
             yield fail(
-                f"{what}: {directory} cannot be written by this user", "run doctor as the service's user, or root"
+                f"{what}: {directory} cannot be written by this user",
+                f"give it to the service: chown arm-companion {directory}",
             )
         elif free < _SPARE_BYTES:
             yield fail(f"{what}: {free / 1e6:.0f} MB are free at {directory}", "delete old records")
