@@ -18,6 +18,7 @@ from typing import Final
 
 from arm_companion.errors import ArmError
 from arm_companion.ground.channel import ArmSilent, Channel
+from arm_companion.ground.texts import Sentences
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 
@@ -26,6 +27,7 @@ GAP_S: Final = 0.7
 TRIES: Final = 5
 
 _AT_ONCE: Final = 10
+_REFUSED: Final = "parameter refused: "
 _LONGEST_NAME: Final = 16
 _KINDS: Final = {
     mav.MAV_PARAM_TYPE_UINT8: ("uint8", "<Bxxx"),
@@ -123,7 +125,7 @@ class ParameterClient:
         before = await self.read(name)
         type_, raw = _encode(before, value)
         after = None
-        async with self._values() as values:
+        async with self._values() as values, self._reasons() as reasons:
             for _ in range(TRIES):
                 await self._channel.send(mav.MAVLink_param_set_message, name.encode("ascii"), raw, type_)
                 while (heard := await _next(values, name)) is not None:
@@ -134,7 +136,8 @@ class ParameterClient:
                     break
         if after is None:
             raise ArmSilent(f"no answer to setting {name}; it was {before.value:g}")
-        raise ParameterRefused(f"{name} stays {after.value:g}: the arm did not take {value:g}")
+        why = reasons[-1] if reasons else f"the arm did not take {value:g}"
+        raise ParameterRefused(f"{name} stays {after.value:g}: {why}")
 
     async def _collect(
         self,
@@ -167,6 +170,23 @@ class ParameterClient:
         end = self._channel.watch(take)
         try:
             yield queue
+        finally:
+            end()
+
+    @contextlib.asynccontextmanager
+    async def _reasons(self) -> "AsyncIterator[list[str]]":
+        """Why the component refuses changes, in its own words."""
+        reasons: list[str] = []
+        sentences = Sentences()
+
+        def take(message: Message) -> None:
+            if message.get_type() == "STATUSTEXT":
+                said = [text.text for text in sentences.take(message)]
+                reasons.extend(text.removeprefix(_REFUSED) for text in said if text.startswith(_REFUSED))
+
+        end = self._channel.watch(take)
+        try:
+            yield reasons
         finally:
             end()
 

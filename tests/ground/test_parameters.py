@@ -121,6 +121,23 @@ def test_what_does_not_fit_is_refused_in_words(scripted: Any, name: str, value: 
     assert service.values == before
 
 
+def test_a_refusal_comes_with_the_arms_reason(scripted: Any) -> None:
+    service = Service(scripted)
+
+    def take(message: Message) -> None:
+        if message.get_type() == "PARAM_SET":
+            scripted.text("parameter refused: LOCKED can change only while the arm is stowed: it is PERCHED")
+        service.take(message)
+
+    scripted.script = take
+
+    async def main() -> None:
+        with pytest.raises(ParameterRefused, match=r"LOCKED stays 1: LOCKED can change only .*: it is PERCHED"):
+            await scripted.arm.parameters.write("LOCKED", 5)
+
+    scripted.run(main)
+
+
 def test_a_late_answer_to_an_earlier_question_is_no_refusal(scripted: Any) -> None:
     """A radio with 0.9 s to and fro: reading is asked twice, and the second answer comes after the value was set."""
     service = Service(scripted)
