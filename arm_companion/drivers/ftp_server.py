@@ -81,7 +81,7 @@ class FtpServer:
         self.counters = FtpCounters()
         self._files = files
         self._sessions: dict[int, _Session] = {}
-        self._answers: dict[_Client, FtpPayload] = {}  # the last one to each, for a request that comes again
+        self._answers: dict[_Client, tuple[FtpPayload, FtpPayload]] = {}  # last request of each, and its answer
         self._bursts: dict[_Client, asyncio.TimerHandle] = {}
 
     def handle(self, message: Message, link: MavlinkLink) -> None:
@@ -95,17 +95,17 @@ class FtpServer:
         if request.opcode in (Opcode.ACK, Opcode.NAK):
             return  # somebody's answer
         self.counters.requests += 1
-        last = self._answers.get(client)
-        if last is not None and last.sequence == (request.sequence + 1) & 0xFFFF and last.answers == request.opcode:
+        asked, last = self._answers.get(client, (None, None))
+        if last is not None and asked == request:  # all of it: a client that starts anew counts from 0 again
             self.counters.repeated += 1
-            self._send(client, last)
+            self._send(client, request, last)
             return
         if (burst := self._bursts.pop(client, None)) is not None:
             burst.cancel()
         if request.opcode == Opcode.BURST_READ_FILE:
             self._burst(client, request, request.sequence, asyncio.get_running_loop().time() + BURST_S)
         else:
-            self._send(client, self._answer(client, request, self._execute))
+            self._send(client, request, self._answer(client, request, self._execute))
 
     def close(self) -> None:
         """Stop bursts that are being sent."""
@@ -208,17 +208,17 @@ class FtpServer:
             asked = FtpPayload(sequence, request.opcode, request.session, request.offset, size=request.size)
             answer = self._answer(client, asked, lambda c, r: (r.session, self._read(c, r)))
             over = answer.opcode != Opcode.NAK and loop.time() >= until
-            self._send(client, dataclasses.replace(answer, burst_complete=over))
+            self._send(client, asked, dataclasses.replace(answer, burst_complete=over))
             if over or answer.opcode == Opcode.NAK or not client[0].connected:
                 return
             ahead = FtpPayload(0, request.opcode, request.session, request.offset + len(answer.data), size=request.size)
             later = partial(self._burst, client, ahead, answer.sequence, until)
         self._bursts[client] = loop.call_later(PACE_S, later)
 
-    def _send(self, client: _Client, answer: FtpPayload) -> None:
+    def _send(self, client: _Client, request: FtpPayload, answer: FtpPayload) -> None:
         link, system, component = client
         self._answers.pop(client, None)
-        self._answers[client] = answer
+        self._answers[client] = request, answer
         if len(self._answers) > _MOST_CLIENTS:
             del self._answers[next(iter(self._answers))]
         link.send(mav.MAVLink_file_transfer_protocol_message(0, system, component, answer.pack()))

@@ -92,6 +92,15 @@ def test_a_request_that_comes_twice_gets_the_same_answer() -> None:
     serve(body)
 
 
+def test_a_client_that_starts_anew_gets_its_own_file() -> None:
+    async def body(rig: ServiceRig) -> None:
+        await open_file(rig.ground)
+        other = await open_file(rig.ground, path=b"/general.json")  # a second run, from 1 again
+        assert int.from_bytes(other.data, "little") == len(FILES["/general.json"])
+
+    serve(body)
+
+
 def test_the_directory_is_listed_to_its_end() -> None:
     async def body(rig: ServiceRig) -> None:
         (answer,) = await ask(rig.ground, FtpPayload(1, Opcode.LIST_DIRECTORY, data=b"/"))
