@@ -42,6 +42,7 @@ _ORDERS: Final = {
     "release": "let go and clear what was held",
     "stow": "straighten the arm",
     "abort": "leave whatever runs on its shortest safe way",
+    "clear": "clear errors whose cause is gone: servos that shut down are rebooted; the arm hangs straight",
 }
 
 

@@ -205,6 +205,11 @@ def _show_jog(arguments: argparse.Namespace, jog: Jog, now: Status) -> None:
     print(f"\r{asked}   {is_at}   step {math.degrees(jog.step_rad):.1f} ", end="", flush=True)
 
 
+async def _clear(arguments: argparse.Namespace, arm: Arm) -> int:
+    work = arm.order(mav.MAV_CMD_ARM_CLEAR_ERRORS, timeout=arguments.timeout)
+    return await follow(arguments, arm, "CLEAR_ERRORS", work)
+
+
 async def _reach(arguments: argparse.Namespace, arm: Arm) -> int:
     def progress(per_cent: int | None) -> None:
         say(arguments, "  REACH in progress" + ("" if per_cent is None else f", {per_cent} %"))
@@ -257,6 +262,7 @@ def _line(parameter: Parameter) -> str:
 
 ACTIONS: Final[dict[str, Action]] = {
     **{name: _order(name) for name in ("ready", "perch", "grasp", "release", "stow", "abort", "calibrate")},
+    "clear": _clear,
     "jog": _jog,
     "reach": _reach,
     "control": _control,

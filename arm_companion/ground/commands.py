@@ -21,6 +21,9 @@ TRIES: Final = 5
 LOST_ANSWER_S: Final = 3.0
 """After resting this long in a state that ends a command, its final answer counts as lost."""
 
+_WORK_AT_REST_S: Final = 10.0
+"""The same for a command that asks for no state: CLEAR_ERRORS works at rest, for up to six seconds."""
+
 _LOOK_S: Final = 0.2
 _REASON_S: Final = 0.6
 
@@ -165,7 +168,7 @@ class _Exchange:
                         f"the arm has not been heard for {self._channel.silence:.0f} s; {self._name} may be going on"
                     ) from None
                 rested = rested + _LOOK_S if self._rests() else 0.0
-                if rested > LOST_ANSWER_S:
+                if rested > (LOST_ANSWER_S if self._goals else _WORK_AT_REST_S):
                     self._judge_by_state()
                     return
         if ack.result != mav.MAV_RESULT_ACCEPTED:

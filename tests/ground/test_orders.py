@@ -1,5 +1,6 @@
 """The command protocol's sending side against a scripted component: losses, liars, silence."""
 
+import argparse
 import asyncio
 import itertools
 from collections.abc import Callable
@@ -7,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from arm_companion.cli import ground_orders
 from arm_companion.ground.channel import ArmSilent
 from arm_companion.ground.commands import TRIES, CommandFailed, CommandUnfinished
 from arm_companion.ground.reports import Status
@@ -263,3 +265,21 @@ def test_a_slow_reader_loses_the_oldest(scripted: Any, make_status: Callable[...
         return seen
 
     assert scripted.run(main) == ["S7", "S8", "S9"]
+
+
+def test_clearing_errors_may_take_its_time_in_a_state_of_rest(scripted: Any, make_status: Any) -> None:
+    """Servos are rebooted and homed for up to six seconds, while the state stays STOWED."""
+    command = mav.MAV_CMD_ARM_CLEAR_ERRORS
+    scripted.script = lambda m: scripted.ack(m.command, IN_PROGRESS)
+
+    async def main() -> None:
+        arguments = argparse.Namespace(action="clear", json=True, timeout=None)
+        clearing = asyncio.create_task(ground_orders.ACTIONS["clear"](arguments, scripted.arm))
+        for _ in range(12):
+            await asyncio.sleep(0.5)
+            scripted.say(make_status("STOWED"))
+        scripted.ack(command, ACCEPTED)
+        assert await clearing == 0
+
+    scripted.run(main)
+    assert [m.command for m in scripted.received] == [command]
