@@ -29,7 +29,9 @@ class KeepOutConfig:
 class LimitsConfig:
     """[limits] What no command that leaves may exceed."""
 
-    tension_min_n: float = option("least tension of every tendon", 0.5, unit="N", lower=0.0, upper=50.0)
+    tension_min_n: float = option(
+        "least tension of every tendon, not over the pretension", 0.5, unit="N", lower=0.0, upper=50.0
+    )
     tension_max_n: float = option("greatest tension of any tendon", 45.0, unit="N", lower=1.0, upper=500.0)
     tension_disagreement_sigma: float = option(
         "a tendon whose load and statics differ by so many sigma counts as broken or jumped", 4.0, lower=1.0, upper=50.0

@@ -103,6 +103,12 @@ class Config:
                 f"perch.wrap_bend_rad = {self.perch.wrap_bend_rad:g} is over limits.bend_max_rad = "
                 f"{self.limits.bend_max_rad:g}"
             )
+        least, pretension = self.limits.tension_min_n, self.arm.tendons.pretension_n
+        if least > max(pretension, LimitsConfig().tension_min_n):  # research may do without a pretension
+            raise ConfigError(
+                f"limits.tension_min_n = {least:g} is over arm.tendons.pretension_n = {pretension:g}: a straight arm's "
+                "tendons could not be let out, nor a bar let go"
+            )
         keep_out = self.limits.keep_out
         if keep_out.half_angle_deg and math.hypot(*keep_out.apex_m) < _LEAST_APEX_M:
             raise ConfigError("limits.keep_out.apex_m is at the centre of mass: the cone would have no direction")

@@ -53,7 +53,7 @@ def test_every_parameter_reads_and_writes_its_option_within_the_schemas_bounds(p
         with pytest.raises(ConfigError, match=parameter.name):
             parameter.write(config, beyond)
     middle = round(0.5 * (option.lower + option.upper)) if parameter.whole else 0.4 * option.lower + 0.6 * option.upper
-    if parameter.name not in ("PERCH_WRAP_BEND", "LIM_BEND"):  # these two bound each other
+    if parameter.name not in ("PERCH_WRAP_BEND", "LIM_BEND", "LIM_TEN_MIN"):  # others bound these
         changed = parameter.write(config, middle)
         assert parameter.read(changed) == pytest.approx(middle, rel=1e-6)
         others = [p for p in PARAMETERS if p is not parameter]
@@ -63,6 +63,9 @@ def test_every_parameter_reads_and_writes_its_option_within_the_schemas_bounds(p
 def test_rules_that_span_two_options_hold_and_whole_numbers_stay_whole() -> None:
     with pytest.raises(ConfigError, match="wrap_bend_rad"):
         BY_NAME["PERCH_WRAP_BEND"].write(Config(), 5.6)
+    with pytest.raises(ConfigError, match="tension_min_n = 30 is over"):
+        BY_NAME["LIM_TEN_MIN"].write(Config(), 30.0)
+    assert BY_NAME["LIM_TEN_MIN"].write(Config(), 4.0).limits.tension_min_n == 4.0
     with pytest.raises(ConfigError, match="whole number"):
         COMPID.write(Config(), 12.5)
 
