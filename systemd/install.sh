@@ -58,6 +58,8 @@ case $ROOT in
     /*) ROOT=${ROOT%/} ;;
     *) ROOT=$(pwd)/${ROOT%/} ;;
 esac
+# lists of directories below and pip's own scripts are split at blanks: something else would be removed
+case $ROOT in *[[:space:]]* | *[*?[]*) misuse "--root $ROOT: a path without blanks and wildcards" ;; esac
 case $MACHINE in
     '') ;;
     aarch64 | x86_64) [ -n "$ROOT" ] || misuse "--machine goes with --root" ;;

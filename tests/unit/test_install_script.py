@@ -174,3 +174,13 @@ def test_a_source_that_is_none_and_a_python_that_is_too_old_are_refused(tmp_path
     old.write_text("#!/bin/sh\nexit 1\n")
     old.chmod(0o755)
     assert "3.11" in call("--root", root, "--python", old, code=1)
+
+
+@pytest.mark.parametrize("name", ["my images", "image*"])
+def test_a_root_that_would_fall_apart_is_refused(tmp_path: Path, name: str) -> None:
+    """`uninstall --purge` below "my images" removed "my"."""
+    (tmp_path / "my").mkdir()
+    for action in (["--no-venv"], ["uninstall", "--purge"]):
+        assert "without blanks" in call(*action, "--root", tmp_path / name, code=2)
+    assert (tmp_path / "my").is_dir()
+    assert [path.name for path in tmp_path.iterdir()] == ["my"]
