@@ -15,6 +15,7 @@ from arm_companion.config.load import checked
 from arm_companion.config.options import spelling
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
+from arm_companion.doctor.config_checks import unusable_files
 from arm_companion.errors import ConfigError
 from arm_companion.record import check_installed
 
@@ -70,6 +71,8 @@ def _check(arguments: argparse.Namespace) -> None:
         open_configured(config)
         check_flyable(config)
         check_installed(config)
+        for file in unusable_files(config):
+            raise ConfigError(file)
     except ConfigError as refused:
         print(f"{arguments.config}: usable, but not for the daemon: {refused}")
     else:

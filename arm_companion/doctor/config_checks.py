@@ -33,7 +33,8 @@ def configuration(subject: Subject) -> Iterator[Outcome]:
     if config.arm.segments:
         yield fail("an arm of several segments cannot be flown yet", "remove [[arm.segments]]")
     yield from _extras(config)
-    yield from _keys(config)
+    for file in unusable_files(config):
+        yield fail(file, "mend the file that it names")
     yield ok(f"{config.vehicle.autopilot}, {len(config.links)} links, {len(config.bus_servos.ids)} servos")
 
 
@@ -67,19 +68,20 @@ def _extras(config: Config) -> Iterator[Outcome]:
         yield warn("mqtt: nothing would be published, aiomqtt is missing", "pip install 'arm-companion[mqtt]'")
 
 
-def _keys(config: Config) -> Iterator[Outcome]:
+def unusable_files(config: Config) -> Iterator[str]:
+    """Files of keys, passwords and certificates without which `run` refuses to start, and why."""
     for name, link in config.links.items():
         if not link.signing_key:
             continue
         try:
             read_key(Path(link.signing_key))
         except ConfigError as error:
-            yield fail(f"link {name}: {error}", "mend the file of the key")
+            yield f"link {name}: {error}"
     try:
         check_files(config.mqtt)
         check_token(config.page.token_file)
     except ConfigError as error:
-        yield fail(str(error), "mend the file that it names")
+        yield str(error)
 
 
 CHECKS: Final = (

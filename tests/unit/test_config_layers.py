@@ -208,6 +208,16 @@ def test_check_lists_the_layers_and_says_what_cannot_fly(file: Path, capsys: pyt
     assert capsys.readouterr().out.strip().endswith("sim.toml: usable")
 
 
+def test_check_opens_the_files_that_the_daemon_needs(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    link = ["--set", "links.autopilot.url=udpin:127.0.0.1:1", "--set", "links.autopilot.role=autopilot"]
+    for setting, words in (
+        ("links.autopilot.signing_key=/nowhere/key", "link autopilot: signing_key /nowhere/key"),
+        ("mqtt.user_file=/nowhere/user", "mqtt.user_file /nowhere/user"),
+    ):
+        assert main(["config", "check", "--config", str(file), *link, "--set", setting]) == 0
+        assert f"not for the daemon: {words}" in capsys.readouterr().out
+
+
 def test_a_file_anywhere_extends_one_that_comes_with_the_package(tmp_path: Path) -> None:
     (tmp_path / "mine.toml").write_text('extends = "zhao2022.toml"\n[vehicle]\nmass_kg = 2.0\n')
     assert load(tmp_path / "mine.toml").vehicle.mass_kg == 2.0
