@@ -20,6 +20,7 @@ from arm_companion.config.options import spelling
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.errors import ConfigError
+from arm_companion.ground.arm import OUR_ADDRESS
 
 ROOT = Path(__file__).parents[2]
 
@@ -172,6 +173,12 @@ def test_the_examples_can_be_used_and_all_but_the_bench_can_fly(file: Path) -> N
 
 
 # --- the command ---
+
+
+@pytest.mark.parametrize("file", [*sorted((ROOT / "configs/examples").glob("*.toml")), ROOT / "systemd/config.toml"])
+def test_what_is_shipped_lets_our_own_ground_station_command(file: Path) -> None:
+    commanders = load(file).vehicle.commanders
+    assert not commanders or OUR_ADDRESS[0] in commanders
 
 
 def test_explain_tells_meaning_range_value_and_origin(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
