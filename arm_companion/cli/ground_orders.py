@@ -26,6 +26,8 @@ from arm_companion.protocol.dialect import mav
 _FOLLOWS_S: Final = 2.0
 _STILL: Final = math.radians(1.0)
 _STATUS_S: Final = 0.3
+_WHILE_HEARD: Final = """It lasts while the arm hears this station, which ends with this program: without another one
+of the same ids, such as `arm-companion ground watch`, it is lost after mavlink.control_timeout_s (10 s)."""
 _LEAVE: Final = 3
 """So many times Ctrl-C leaves an order that is under way."""
 
@@ -229,7 +231,10 @@ async def _control(arguments: argparse.Namespace, arm: Arm) -> int:
     work = (
         arm.release_control() if arguments.verb == "release" else arm.take_control(force=arguments.verb == "take-over")
     )
-    return await follow(arguments, arm, "CONTROL", work)
+    code = await follow(arguments, arm, "CONTROL", work)
+    if code == DONE and arguments.verb != "release":
+        say(arguments, _WHILE_HEARD)
+    return code
 
 
 async def _params(arguments: argparse.Namespace, arm: Arm) -> int:

@@ -283,3 +283,13 @@ def test_clearing_errors_may_take_its_time_in_a_state_of_rest(scripted: Any, mak
 
     scripted.run(main)
     assert [m.command for m in scripted.received] == [command]
+
+
+@pytest.mark.parametrize(("verb", "told"), [("take", True), ("take-over", True), ("release", False)])
+def test_who_takes_control_is_told_that_it_ends_with_the_program(
+    scripted: Any, capsys: pytest.CaptureFixture[str], verb: str, *, told: bool
+) -> None:
+    scripted.script = lambda m: scripted.ack(m.command, ACCEPTED)
+    arguments = argparse.Namespace(action="control", verb=verb, json=False, timeout=None)
+    assert scripted.run(lambda: ground_orders.ACTIONS["control"](arguments, scripted.arm)) == 0
+    assert ("control_timeout_s" in capsys.readouterr().out) is told
