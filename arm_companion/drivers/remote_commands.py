@@ -1,7 +1,7 @@
 """Commands over MQTT and from the field page: nonce and age first, then exactly the way of a command over MAVLink."""
 
 import logging
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable
 from typing import Final, cast
 
@@ -30,6 +30,8 @@ _RESULTS: Final = {
     number: entry.name.removeprefix("MAV_RESULT_").lower() for number, entry in mav.enums["MAV_RESULT"].items()
 }
 _MOST_NONCES: Final = 1024
+_MOST_WAITING: Final = 8
+"""Only STOW and ABORT may come again while they are under way; of more than so many the first get no answer."""
 
 
 class RemoteCommands:
@@ -66,7 +68,7 @@ class RemoteCommands:
         self._started = self._now()
         self._seen: OrderedDict[str, Order] = OrderedDict()
         self._answers: dict[str, Packet] = {}
-        self._under_way: dict[int, str] = {}  # by MAV_CMD: nonce of the order that waits for its outcome
+        self._under_way: dict[int, deque[str]] = {}  # by MAV_CMD: nonces of the orders that wait for its outcome
         self._reason = ""
 
     def take(self, payload: bytes) -> None:
@@ -116,14 +118,13 @@ class RemoteCommands:
         if len(self._seen) >= _MOST_NONCES and order.command not in _URGENT:
             return "too many commands at once"
         self._seen[order.nonce] = order
-        waiting = self._under_way.get(_NUMBERS[order.command])
-        if waiting is not None and order.command not in _URGENT:
+        if _NUMBERS[order.command] in self._under_way and order.command not in _URGENT:
             return "the same command is under way"
         return None
 
     def _forget(self, before: float) -> None:
         """A nonce whose order is too old in any case need not be known."""
-        under_way = set(self._under_way.values())
+        under_way = {nonce for nonces in self._under_way.values() for nonce in nonces}
         for nonce in [n for n, order in self._seen.items() if order.time < before and n not in under_way]:
             del self._seen[nonce]
             self._answers.pop(nonce, None)
@@ -134,7 +135,7 @@ class RemoteCommands:
         # whoever lets orders in here has seen to who sends them, which stands for a signature
         sender = Sender(self._system, _COMPONENT, "ground", ours=False, trusted=True)
         log.info("%s: %s %s", self.name, order.command, list(order.parameters))
-        self._under_way[number] = order.nonce
+        self._under_way.setdefault(number, deque(maxlen=_MOST_WAITING)).append(order.nonce)
         self._service.handle(Command(number, parameters, 0, sender), cast("MavlinkLink", self))
 
     def send(self, message: Message) -> None:
@@ -142,17 +143,18 @@ class RemoteCommands:
         match message.get_type():
             case "STATUSTEXT":
                 self._reason = (self._reason if message.chunk_seq else "") + message.text
-            case "COMMAND_ACK" if (nonce := self._under_way.get(message.command)) is not None:
+            case "COMMAND_ACK" if (nonces := self._under_way.get(message.command)) is not None:
                 done = message.result != mav.MAV_RESULT_IN_PROGRESS
                 if done:
                     del self._under_way[message.command]
-                self._tell(
-                    nonce,
-                    self._seen[nonce].command,
-                    _RESULTS.get(message.result, "failed"),
-                    percent=None if done else progress(message.progress),
-                    reason=self._reason,
-                )
+                for nonce in nonces:
+                    self._tell(
+                        nonce,
+                        self._seen[nonce].command,
+                        _RESULTS.get(message.result, "failed"),
+                        percent=None if done else progress(message.progress),
+                        reason=self._reason,
+                    )
                 self._reason = ""
 
     def _tell(

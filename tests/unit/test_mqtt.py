@@ -413,6 +413,19 @@ def test_the_same_command_twice_is_one_at_a_time_and_safety_is_always_taken() ->
     at_a_desk(test)
 
 
+def test_each_of_two_stows_under_way_gets_its_answer() -> None:
+    async def test(desk: Desk) -> None:
+        desk.send("STOW", "first")
+        (request,) = desk.requests()
+        desk.send("STOW", "second")
+        assert desk.requests() == []
+        desk.component.answer(Answer(request.id, Result.ACCEPTED))
+        assert [(a["nonce"], a["result"]) for a in desk.answers()] == [("first", "accepted"), ("second", "accepted")]
+        assert [a["result"] for a in desk.send("STOW", "first")] == ["accepted"]
+
+    at_a_desk(test)
+
+
 def test_control_can_be_taken_and_malformed_orders_are_answered() -> None:
     async def test(desk: Desk) -> None:
         (answer,) = desk.send("CONTROL", "c", 1.0)
