@@ -3,6 +3,7 @@
 import io
 import json
 import os
+import stat
 import subprocess
 import tarfile
 import tomllib
@@ -83,6 +84,8 @@ def write(path: Path, files: Mapping[str, str], unix_s: float) -> None:
         OSError: it cannot be written.
     """
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o600)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):  # one that was there keeps its mode, and a device is not ours
+        os.fchmod(descriptor, 0o600)
     with os.fdopen(descriptor, "wb") as stream, tarfile.open(fileobj=stream, mode="w:gz") as archive:
         for name, text in files.items():
             data = text.encode()

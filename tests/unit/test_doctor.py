@@ -497,3 +497,11 @@ def test_what_the_configuration_needs_and_is_not_installed_is_told(
     assert told.level is Level.FAIL
     assert "arm-companion[record]" in told.found
     assert found(with_(subject, config={"record": RecordConfig()}), "configuration").level is Level.OK
+
+
+def test_a_report_over_an_older_file_is_for_its_maker_alone(tmp_path: Path) -> None:
+    path = tmp_path / "report.tar.gz"
+    path.write_bytes(b"older")
+    path.chmod(0o644)
+    report.write(path, {"log.txt": "x"}, NOW)
+    assert path.stat().st_mode & 0o777 == 0o600
