@@ -186,6 +186,8 @@ def _wrong_usage(arguments: argparse.Namespace) -> str:
             return "" if len(together) == 1 else "--object, --object-axis-deg and --object-radius belong together"
         case "calibrate" if not (arguments.yes or sys.stdin.isatty()):
             return "nobody is there to confirm that nothing touches the arm: give --yes"
+        case "jog" if arguments.theta_deg is not None and arguments.vehicle is not None:
+            return "--theta-deg moves the arm and --vehicle the vehicle: give one of them"
         case "jog" if arguments.theta_deg is None and arguments.vehicle is None and not sys.stdin.isatty():
             return "the keyboard needs a terminal; without one give --theta-deg or --vehicle"
     return ""

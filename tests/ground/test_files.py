@@ -132,6 +132,7 @@ def test_plot_draws_a_record_without_an_arm(
         (["params", "set", "X"], "params set NAME VALUE"),
         (["params", "list", "X"], "params list"),
         (["perch", "--bar", "1", "2", "-3"], "belong together"),
+        (["jog", "--theta-deg", "10", "--vehicle", "0", "0", "0.01"], "give one of them"),
         (["jog"], "needs a terminal"),
         (["calibrate"], "--yes"),
     ],
