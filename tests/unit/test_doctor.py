@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import tarfile
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -289,32 +290,39 @@ def test_the_parameters_that_the_service_has_kept_are_in_force(
     assert seen.config.perch.wrap_bend_rad == 3.0
 
 
+@pytest.fixture
+def open_place(quiet_machine: Path) -> Iterator[Path]:
+    """A directory into which other users see, as they do not into pytest's own."""
+    assert quiet_machine.is_dir()
+    with tempfile.TemporaryDirectory() as place:
+        Path(place).chmod(0o755)
+        yield Path(place)
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may read and write everything")
 def test_root_sees_what_the_services_user_may_not(
-    quiet_machine: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    open_place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """`sudo arm-companion doctor`: a key of root's, and a directory of root's, are well for root alone."""
     monkeypatch.setattr(command, "_USER", "nobody")
-    for folder in (quiet_machine, *quiet_machine.parents[:2]):
-        folder.chmod(0o755)
-    key = quiet_machine / "key"
+    key = open_place / "key"
     key.write_bytes(bytes(range(32)))
     key.chmod(0o600)
-    file = quiet_machine / "config.toml"
+    file = open_place / "config.toml"
     file.write_text(
         f'[links.autopilot]\nurl = "udpin:127.0.0.1:1"\nrole = "autopilot"\nsigning_key = "{key}"\n'
-        f'[record]\ndirectory = "{quiet_machine}"\n',
+        f'[record]\ndirectory = "{open_place}"\n',
         encoding="utf-8",
     )
     rows = {}
-    for system_file in (file, quiet_machine / "another.toml"):
+    for system_file in (file, open_place / "another.toml"):
         monkeypatch.setattr(command, "SYSTEM_FILE", system_file)
         main(["doctor", "--offline", "--json", "--config", str(file)])
         rows[system_file] = {row["check"]: row for row in json.loads(capsys.readouterr().out)["checks"]}
         assert os.geteuid() == 0
     assert "Permission denied" in rows[file]["configuration"]["found"]
     assert "cannot be written by this user" in rows[file]["disk"]["found"]
-    assert rows[quiet_machine / "another.toml"]["configuration"]["level"] == "ok"
+    assert rows[open_place / "another.toml"]["configuration"]["level"] == "ok"
 
 
 def test_while_the_daemon_runs_nothing_is_opened(
