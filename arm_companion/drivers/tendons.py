@@ -70,7 +70,10 @@ class Tendons:
         return self._servos.zero_ticks[i] + round(self._servos.directions[i] * wound / self._m_per_tick)
 
     def states(self, servos: Sequence[ServoState]) -> tuple[TendonState, ...]:
-        """State of each tendon; one whose servo was never heard has sigma inf and zeros."""
+        """State of each tendon; one whose servo was never heard has sigma inf and zeros.
+
+        The tension of one that fell silent is what it said last, and its sigma inf: nobody knows what it is now.
+        """
         heard = [math.isfinite(servo.age_s) for servo in servos]
         pulls = [self.wound(i, servo.position) if heard[i] else 0.0 for i, servo in enumerate(servos)]
         speeds = [d * s.speed * self._m_per_tick for d, s in zip(self._servos.directions, servos, strict=True)]
@@ -80,6 +83,9 @@ class Tendons:
             else Tension(0.0, math.inf, math.inf)
             for i, servo in enumerate(servos)
         ]
+        for i, servo in enumerate(servos):
+            if servo.silent:
+                forces[i] = Tension(forces[i].value, math.inf, math.inf)
         if self._coupling is not None:
             pulls, speeds = _times(self._coupling, pulls), _times(self._coupling, speeds)
             forces = _mixed(self._to_tension, forces)
@@ -151,8 +157,9 @@ class Tendons:
         lower, upper = before - step, before + step
         if i < len(self.latest):
             state = self.latest[i]
-            if state.tension > limits.tension_max_n:
-                upper = max(before - _EASING_SHARE * step, lower)
+            # what a servo said before it fell silent is no reason to let out, cycle after cycle
+            if state.tension > limits.tension_max_n and math.isfinite(state.tension_sigma):
+                upper = max(before - _EASING_SHARE * step, min(before, -reach))  # as far as any goal may go
             elif state.tension + 2.0 * state.tension_sigma < limits.tension_min_n:
                 lower = before
         return min(max(wanted, lower), upper)

@@ -265,7 +265,7 @@ def _tensions(facts: Facts, state: State, prediction: Prediction) -> tuple[Tensi
         return tuple(TensionEstimate(t.tension, t.tension_sigma) for t in facts.tendons)
     return tuple(
         TensionEstimate(*fuse((t.tension, t.tension_sigma), (says.tension, says.sigma)))
-        if says.exact and t.torque and t.homed and not suspect.fault
+        if says.exact and t.torque and t.homed and not (t.silent or suspect.fault)
         else TensionEstimate(t.tension, t.tension_sigma)
         for t, says, suspect in zip(facts.tendons, prediction.tensions, state.watch, strict=True)
     )

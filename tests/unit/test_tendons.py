@@ -159,6 +159,30 @@ def test_an_over_tight_tendon_is_let_out_whatever_is_wanted() -> None:
     assert t.wound(1, goals[1]) > 1e-4
 
 
+def test_a_tendon_that_stays_tight_is_let_out_no_farther_than_any_goal_may_go() -> None:
+    t = tendons(tension_max_n=20.0)
+    jammed = servos(loads=(0.5, 0.1, 0.1, 0.1))
+    for cycle in range(1000):
+        t.states(jammed)
+        goals = t.goals((0.0,) * 4, 0.01 * cycle)
+    assert t.wound(0, goals[0]) == pytest.approx(-LIMITS.pull_max_m, abs=1e-5)
+
+
+@pytest.mark.parametrize("load", [0.5, 0.0])
+def test_a_servo_that_fell_silent_is_not_let_out_for_what_it_said_last(load: float) -> None:
+    t = tendons(tension_max_n=20.0, tension_min_n=2.0)
+    heard = servos(loads=(load, 0.1, 0.1, 0.1))
+    t.states(heard)
+    t.goals((0.0,) * 4, 0.0)
+    heard[0] = dataclasses.replace(heard[0], silent=True, age_s=0.2)
+    for cycle in range(1, 200):
+        silent, other, *_ = t.states(heard)
+        goals = t.goals((0.0,) * 4, 0.01 * cycle)
+    assert silent.tension_sigma == math.inf
+    assert other.tension_sigma < math.inf
+    assert t.wound(0, goals[0]) == pytest.approx(0.0, abs=1e-5)
+
+
 def test_only_a_tendon_that_is_surely_slack_is_not_let_out() -> None:
     sure = dataclasses.replace(SERVOS, load_sigma=0.0005, friction_torque_nm=0.0, load_torque_sigma=0.0)
     for config, out in ((SERVOS, True), (sure, False)):

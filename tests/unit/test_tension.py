@@ -2,6 +2,8 @@
 
 import dataclasses
 import math
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -9,8 +11,10 @@ from hypothesis import strategies as st
 
 from arm_companion.arm.tension import LoadCurve, fuse, statics_sigma
 from arm_companion.config.schema import LimitsConfig
-from arm_companion.mission.facts import TendonState
+from arm_companion.mission.facts import Facts, TendonState
+from arm_companion.mission.mission import _tensions
 from arm_companion.mission.tendon_watch import Expected, TendonWatch, watch
+from tests.unit.conftest import HOVER
 
 CURVE = LoadCurve(140.0, 12.0, 0.02, 0.01, 5.0, 0.4, 0.01)
 LIMITS = LimitsConfig()
@@ -49,6 +53,17 @@ def test_fusion_lies_between_is_surer_than_either_and_does_not_care_for_the_orde
 def test_an_estimate_without_any_knowledge_does_not_count() -> None:
     assert fuse((3.0, 1.0), (9.0, math.inf)) == fuse((9.0, math.inf), (3.0, 1.0)) == (3.0, 1.0)
     assert statics_sigma(10.0, 3000.0, 0.001, 0.05) == pytest.approx(math.hypot(3.0, 0.5))
+
+
+def test_statics_are_not_trusted_on_a_tendon_whose_servo_is_silent() -> None:
+    """It may have lost its power and let go."""
+    says = Expected(12.0, 1.0, exact=True)
+    silent = dataclasses.replace(TENDON, silent=True, tension_sigma=math.inf)
+    prediction: Any = SimpleNamespace(tensions=(says, says))
+    state: Any = SimpleNamespace(watch=(TendonWatch(), TendonWatch()))
+    heard, unheard = _tensions(Facts(HOVER, (TENDON, silent)), state, prediction)
+    assert heard.sigma < 1.0
+    assert unheard.sigma == math.inf
 
 
 # The watch.
