@@ -40,6 +40,7 @@ _EXPERIMENTS = {
     "perching": "the paper's perching benchmark: tip held, base moved in x and z and back",
 }
 _LARGEST = 1e9  # of any argument: beyond it lie no arms, and squares overflow
+_SLOWEST_MM_S = 1e-6  # slower than that, times are no numbers any more
 _TIPS = {"clamped": HoldKind.CLAMPED, "pinned": HoldKind.PINNED}
 
 
@@ -292,8 +293,8 @@ def _stiffness_test(arguments: argparse.Namespace, config: Config, parameters: A
 
 
 def _perching(arguments: argparse.Namespace, parameters: ArmParameters, gravity: Array) -> int:
-    if arguments.speed_mm_s <= 0:
-        raise _RefusedError("--speed-mm-s must be positive")
+    if arguments.speed_mm_s < _SLOWEST_MM_S:
+        raise _RefusedError(f"--speed-mm-s starts at {_SLOWEST_MM_S:g}")
     asked = (("x", 1e-3 * arguments.x_mm), ("z", 1e-3 * arguments.z_mm))
     travels = perching.run(
         parameters,

@@ -5,6 +5,7 @@ speed, then the same along z. A force sensor between carrier and arm reads force
 quasi-static; time is travel over speed. The paper prints neither speed nor numbers.
 """
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -126,11 +127,11 @@ def _travel(
     case: Case, unloaded: ArmSolution, axis: str, distance: float, kind: HoldKind, speed: float, step: float
 ) -> Travel:
     count = max(1, round(abs(distance) / step))
-    out = [distance * k / count for k in range(count + 1)]
     samples: list[Sample] = []
     covered, here, now = 0.0, 0.0, None
     try:
-        for travel in (*out, *reversed(out[:-1])):
+        for k in itertools.chain(range(count + 1), range(count - 1, -1, -1)):
+            travel = distance * k / count
             covered, here = covered + abs(travel - here), travel
             move = np.zeros(3)
             move[AXES[axis]] = travel

@@ -8,7 +8,7 @@ the more it is bent, both ways. It prints no numbers and not which bends; 0 to 6
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,12 +130,20 @@ def run(
     """
     model = RodModel(parameters)
     g = np.asarray(gravity, dtype=np.float64)
-    schedule = list(loads(step, steps, cycles))
-    return [_curve(model, angle, inward, g, mu, schedule) for inward in (True, False) for angle in bends_deg]
+    return [
+        _curve(model, angle, inward, g, mu, loads(step, steps, cycles))
+        for inward in (True, False)
+        for angle in bends_deg
+    ]
 
 
 def _curve(
-    model: RodModel, bend_deg: float, inward: bool, gravity: Array, mu: float, schedule: list[tuple[int, bool, float]]
+    model: RodModel,
+    bend_deg: float,
+    inward: bool,
+    gravity: Array,
+    mu: float,
+    schedule: Iterable[tuple[int, bool, float]],
 ) -> Curve:
     pull = goals(model.parameters, bend_deg)
     readings: list[Reading] = []

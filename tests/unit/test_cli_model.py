@@ -188,7 +188,8 @@ def test_base_turns_either_way_mirror_each_other(ask: Asker) -> None:
         (["stiffness-test", "--cycles", 0], "start at 1"),
         (["stiffness-test", "--friction", -0.1], "negative"),
         (["perching", "--x-mm", 0, "--z-mm", 0], "nothing to do"),
-        (["perching", "--speed-mm-s", 0], "positive"),
+        (["perching", "--speed-mm-s", 0], "starts at"),
+        (["perching", "--speed-mm-s", 1e-320], "starts at"),
     ],
 )
 def test_refusals_are_one_line_and_exit_code_two(ask: Asker, words: list[object], reason: str) -> None:

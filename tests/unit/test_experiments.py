@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import re
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -199,6 +200,21 @@ def test_pinned_is_softer_than_clamped_and_moves_the_tendons(travels: list[perch
     assert all(np.allclose(s.tip_moment, 0, atol=1e-8) for s in pinned.samples)
     assert "slide" in perching.findings([pinned])[-1]
     assert "no hysteresis" in perching.findings(travels)[-1]
+
+
+def test_an_absurd_travel_or_load_ends_where_the_arm_does_and_takes_no_memory_for_the_rest() -> None:
+    """A million millimetres were a list of four million places before the first was looked at."""
+    arm = case.arm(Config())
+    tracemalloc.start()
+    try:
+        (travel,) = perching.run(arm, travels=[("x", 1e3)], step=1e-3)
+        curves = stiffness_test.run(arm, bends_deg=(0.0,), steps=1_000_000, cycles=1)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert travel.refusal
+    assert all(curve.refusal for curve in curves)
+    assert peak < 20e6
 
 
 # --- files ---
