@@ -35,6 +35,8 @@ _MU_MAX = 2.0
 _USELESS = 0.5  # one sigma, relative, above which a parameter is not told by the test
 _MU_USELESS = 0.2
 _HOPELESS = 0.05  # scatter about the fit, of the length, at which the model does not describe the data
+_FOREIGN = 0.2  # scatter of tensions about the fit, of their size, at which they are not this arm's
+_FOREIGN_N = 0.5  # and not under this, N: small tensions are read no better
 _CONFIDENCE = 0.95
 _SUSPECTS = "check units, signs and axes of loads and readings"
 
@@ -204,6 +206,14 @@ def _check(problem: "_Problem", solved: "_Solved") -> None:
         off = solved.scatter.get(kind, 0.0)
         if off > _HOPELESS * problem.parameters.L:
             raise NotIdentifiable(f"after the fit the {kind} is still off by {1e3 * off:.0f} mm: {_SUSPECTS}")
+    # Positions hold the fit together while tensions of another unit or order pull k_T and T0 away from the arm's. Where
+    # T0 is held they may be off for that alone.
+    tensions = problem.measured[np.array(problem.channels) == TENSION]
+    off = solved.scatter.get(TENSION, 0.0)
+    if "T0" in solved.x and tensions.size and off > max(_FOREIGN * math.sqrt(float(np.mean(tensions**2))), _FOREIGN_N):
+        raise NotIdentifiable(
+            f"after the fit the tensions are still off by {off:.1f} N: check their unit and order, or leave them out"
+        )
 
 
 class _Problem:

@@ -107,6 +107,8 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
         raise _RefusedError("--output extends the configuration file: put what --set changes into that file")
     if config.arm.segments:
         raise _RefusedError(f"a loading test is fitted for one segment, and this arm has {len(config.arm.chain)}")
+    if arguments.output is not None and arguments.output.resolve() == arguments.data.resolve():
+        raise _RefusedError(f"--output: {arguments.output} is the file of the measurements")
     parameters = case.arm(config, Guides(arguments.guides))
     readings = loading_csv.parse(arguments.data.read_text(encoding="utf-8-sig"), RodModel(parameters))
     field = case.field(config, on=arguments.gravity, attitude_deg=arguments.attitude_deg)
@@ -114,16 +116,32 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
     names = [name.strip() for name in arguments.fit.split(",") if name.strip()]
     fit = identification.fit(parameters, test, names, mu=config.arm.tendons.guide_friction, fast=_compiled())
     if arguments.output is not None:
-        arguments.output.parent.mkdir(parents=True, exist_ok=True)
-        base = locate(arguments.config)
-        arguments.output.write_text(drop_in(fit, config, base, arguments.output), encoding="utf-8")
-        load(base if _among_drop_ins(base, arguments.output) else arguments.output)  # what is written must be usable
+        _write(fit, config, locate(arguments.config), arguments.output)
     if arguments.figure is not None:
         from arm_companion.experiments import figures  # noqa: PLC0415 - matplotlib is optional
 
         figures.calibration(test, fit, arguments.figure)
     print(json.dumps(_plain(fit, len(readings))) if arguments.json else _table(fit, len(readings)))
     return 0
+
+
+def _write(fit: Fit, config: Config, base: Path, target: Path) -> None:
+    """The drop-in, when it can be used; what was there before stays when it cannot.
+
+    Raises:
+        ConfigError: it would extend itself, or what was fitted is out of bounds.
+    """
+    target.parent.mkdir(parents=True, exist_ok=True)
+    before = target.read_bytes() if target.exists() else None
+    try:
+        target.write_text(drop_in(fit, config, base, target), encoding="utf-8")
+        load(base if _among_drop_ins(base, target) else target)
+    except (ConfigError, OSError):
+        if before is not None:
+            target.write_bytes(before)
+        else:
+            target.unlink(missing_ok=True)
+        raise
 
 
 def _compiled() -> bool:

@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace, config: Config) -> int:
     Raises:
         RefusedError: it cannot be done; one line for people.
     """
+    config.check_servos()
     directory = state_directory(arguments, config)
     if config.servos.coupling:
         raise RefusedError("coupled tendons cannot be taken up one at a time: set servos.zero_ticks by hand")

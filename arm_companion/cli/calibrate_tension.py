@@ -12,7 +12,7 @@ from arm_companion.drivers import calibration_files as files
 from arm_companion.drivers.calibration import VERSION, TensionCalibration, TensionFit, identity
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.workshop.rig import Rig
-from arm_companion.workshop.tension_gain import Bench, Fit, describe, procedure
+from arm_companion.workshop.tension_gain import Bench, describe, procedure
 
 
 def add_parser(commands: "argparse._SubParsersAction[NumberParser]") -> None:
@@ -38,6 +38,7 @@ def run(arguments: argparse.Namespace, config: Config) -> int:
         RefusedError: it cannot be done; one line for people.
     """
     path = state_directory(arguments, config) / files.TENSION
+    _stored(path)
     n = len(config.servos.ids)
     chosen = sorted(set(arguments.tendon or range(1, n + 1)))
     if not all(1 <= number <= n for number in chosen):
@@ -65,24 +66,30 @@ def run(arguments: argparse.Namespace, config: Config) -> int:
                 result.scatter,
                 result.readings,
             )
+            terminal.say(f"{name}:\n{describe(result)}")  # first: a disk that fails costs nobody the numbers
             _store(path, found)
-            terminal.say(_report(name, result, path))
+            terminal.say(f"  stored in {path}")
         return True
 
     return 0 if on_the_bench(config, work) else 130
 
 
-def _report(name: str, result: Fit, path: Path) -> str:
-    return f"{name}:\n{describe(result)}\n  stored in {path}"
+def _stored(path: Path) -> tuple[TensionFit, ...]:
+    """The fits that are there.
+
+    Raises:
+        RefusedError: the file is damaged.
+    """
+    try:
+        found = files.read(TensionCalibration, path)
+    except ValueError as error:
+        raise RefusedError(f"{error}; remove it first") from error
+    return () if found is None else found.fits
 
 
 def _store(path: Path, fit: TensionFit) -> None:
     """Replace this servo's fit, and keep those of the others."""
-    try:
-        before = files.read(TensionCalibration, path)
-    except ValueError as error:
-        raise RefusedError(f"{error}; remove it first") from error
-    others = tuple(other for other in before.fits if other.servo.id != fit.servo.id) if before is not None else ()
+    others = tuple(other for other in _stored(path) if other.servo.id != fit.servo.id)
     try:
         files.save(path, TensionCalibration(VERSION, (*others, fit)))
     except OSError as error:

@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import sys
+import termios
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeVar
@@ -43,11 +44,21 @@ class Terminal:
 
     async def ask(self, text: str, *, sure: bool) -> str | None:
         """The next line typed, None at the end of input."""
+        self._forget()
         print(f"\n{text}", flush=True)
         if self._yes and sure:
             return ""
         print("> ", end="", flush=True)
         return await self._line()
+
+    def _forget(self) -> None:
+        """Keys pressed before a question stands there are no answer to it: a second Enter would let a weight drop.
+
+        What comes through a pipe may be ahead of the questions.
+        """
+        if not self._ended and sys.stdin.isatty():
+            termios.tcflush(sys.stdin.fileno(), termios.TCIFLUSH)
+            self._typed = b""
 
     async def _line(self) -> str | None:
         loop = asyncio.get_running_loop()
@@ -83,12 +94,20 @@ def state_directory(arguments: argparse.Namespace, config: Config) -> Path:
     """Where results go.
 
     Raises:
-        RefusedError: neither the arguments nor the configuration say so.
+        RefusedError: neither the arguments nor the configuration say so, or nothing can be kept there: better now than
+            after all has been measured.
     """
     named = arguments.directory or config.calibration.directory
     if not named:
         raise RefusedError("nowhere to keep the result: set calibration.directory in the configuration, or --directory")
-    return Path(named)
+    directory = Path(named)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RefusedError(f"{directory} cannot be written: {error.strerror}") from error
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise RefusedError(f"{directory} cannot be written by this user")
+    return directory
 
 
 def on_the_bench(config: Config, work: Callable[[Rig, ServoBus], Awaitable[T]]) -> T | None:

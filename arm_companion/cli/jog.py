@@ -43,9 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Jog until q; exit code 0, 2 when it cannot begin, 1 when a servo or the bus failed."""
     config = load_from(arguments)
+    config.check_servos()
     refusal = ""
     if not 0.1 <= arguments.speed_deg_s <= 60.0:
         refusal = f"--speed-deg-s: {arguments.speed_deg_s:g} is not in 0.1 to 60"
+    elif config.arm.segments:
+        refusal = "arm.segments: keys bend an arm of one segment"
     elif not (sys.stdin.isatty() and sys.stdout.isatty()):
         refusal = "it needs a terminal"
     if refusal:

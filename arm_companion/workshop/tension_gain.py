@@ -82,6 +82,8 @@ def fit(readings: Sequence[Reading]) -> Fit:
     tensions = {round(reading.tension, 2) for reading in readings if reading.direction > 0}
     if len(tensions) < _LEAST_TENSIONS or max(tensions) - min(tensions) < _LEAST_SPAN_N:
         raise ModelError(f"at least {_LEAST_TENSIONS} tensions are needed, {_LEAST_SPAN_N:g} N or more apart")
+    if not any(reading.direction < 0 for reading in readings):
+        raise ModelError("no reading on the way out counts: friction and offset cannot be told apart")
     volts = float(np.mean([reading.voltage for reading in readings]))
     A = np.array([(reading.tension, reading.direction, 1.0) for reading in readings])
     load = np.array([reading.load * reading.voltage / volts for reading in readings])
@@ -166,8 +168,12 @@ def procedure(i: int, name: str, n: int, bench: Bench) -> Procedure[Fit]:
             if known is None:
                 way = "in" if direction > 0 else "out"
                 known = yield AskNumber(f"What did the scale say on the way {way}, N? (empty: do not count it)")
-            if known is not None and 0.0 <= known <= bench.tension_max:
+            if known is None:
+                continue
+            if 0.0 <= known <= bench.tension_max:
                 readings.append(reading(trace, i, known, direction))
+            else:
+                yield Say(f"{known:g} N is not between 0 and {bench.tension_max:g} N: it does not count.")
         count = len({r.tension for r in readings if r.direction > 0})
         yield Say(f"{count} tensions so far.")
     yield Ask("Take the weight or scale off: the torque goes off now.", sure=False)

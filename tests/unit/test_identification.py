@@ -224,13 +224,17 @@ def changed(readings: tuple[Reading, ...], **values: Callable[[Reading], Any]) -
         {"follower": lambda r: 0.00981 * r.follower},  # a load column in another unit
         {"follower": lambda r: 12 * r.follower},
         {"position": lambda r: r.position[[1, 2, 0]]},  # axes
+        {"tension": lambda r: r.tension / 9.80665},  # kg
+        {"tension": lambda r: r.tension / 4.448},  # pounds
+        {"tension": lambda r: 10 * r.tension},
+        {"tension": lambda r: r.tension[[1, 2, 3, 0]]},  # counted from another tendon
     ],
-    ids=["sign", "unit", "large", "axes"],
+    ids=["sign", "unit", "large", "axes", "kg", "pounds", "tenfold", "order"],
 )
 def test_data_that_contradict_the_model_give_no_numbers(
     nominal: ArmParameters, exact: tuple[Reading, ...], wrong: dict[str, Callable[[Reading], Any]]
 ) -> None:
-    with pytest.raises(NotIdentifiable, match="check units, signs and axes"):
+    with pytest.raises(NotIdentifiable, match=r"check units, signs and axes|check their unit and order"):
         ident.fit(nominal, changed(exact, **wrong), ("EI", "k_T", "T0"))
 
 
@@ -369,3 +373,24 @@ def test_refusals_of_the_command(
     assert out == ""
     assert err.count("\n") == 1
     assert reason in err
+
+
+def test_the_output_never_costs_a_file_that_was_there(
+    tmp_path: Path, exact: tuple[Reading, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    data, mine = Path("test.csv"), Path("mine.toml")
+    data.write_text(as_csv(noisy(exact, 1)), encoding="utf-8")
+    mine.write_text("[arm]\npulley_radius_m = 0.012\n", encoding="utf-8")
+    kept = [file.read_bytes() for file in (data, mine)]
+    words = (data, "--config", mine, "--fit", "EI", "--output")
+    assert calibrate(*words, data) == 2
+    assert "file of the measurements" in capsys.readouterr().err
+    assert calibrate(*words, mine) == 78  # it would extend itself
+    mine_d = Path("mine.d")
+    mine_d.mkdir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("arm_companion.cli.calibrate.drop_in", lambda *_: "[arm.tendons]\nguide_friction = 3.0\n")
+        assert calibrate(*words, mine_d / "50-fit.toml") == 78  # out of bounds: no daemon would start on it
+    assert [file.read_bytes() for file in (data, mine)] == kept
+    assert not list(mine_d.iterdir())

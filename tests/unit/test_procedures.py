@@ -24,6 +24,7 @@ from arm_companion.procedures.actions import (
     Procedure,
     Release,
     Sample,
+    Say,
     Trace,
 )
 from arm_companion.procedures.take_up import balanced, combine, knee
@@ -267,11 +268,34 @@ def test_the_intervals_hold_the_truth_and_shrink_with_the_noise() -> None:
         (series((0.1, 0.15, 0.2)), "apart"),
         (series((0.5, 1.0, 2.0), gain=-150.0), "does not grow"),
         (series((0.5, 1.0, 2.0), friction=-5.0), "directions"),
+        (series((0.5, 1.0, 2.0))[::2], "the way out"),
+        (series((0.5, 1.0, 1.5, 2.0))[::2], "the way out"),
     ],
 )
 def test_a_series_that_cannot_be_right_is_refused(readings: list[Reading], reason: str) -> None:
     with pytest.raises(ModelError, match=reason):
         fit(readings)
+
+
+def test_a_scales_reading_that_cannot_be_is_not_dropped_in_silence() -> None:
+    class Scale(Arithmetic):
+        strokes = 0
+
+        def perform(self, action: Action) -> Any:
+            if isinstance(action, Say):
+                self.asked.append(action.text)
+            if isinstance(action, Ask) and "one more stroke" in action.text:
+                self.strokes += 1
+                return self.strokes <= 2
+            return super().perform(action)
+
+    bench = Scale(lambda _: np.zeros(4))
+    bench.numbers = [math.nan, None, 1e9, -2.0]
+    with pytest.raises(Refused, match="at least 3 tensions"):
+        bench.run(tension_procedure(1, "tendon 2 (servo 12)", 4, Bench(scale=True)))
+    assert [text.split(":")[0] for text in bench.asked if "does not count" in text] == [
+        f"{known} N is not between 0 and 45 N" for known in ("nan", "1e+09", "-2")
+    ]
 
 
 def test_weights_are_asked_for_until_an_empty_line_and_absurd_ones_again() -> None:

@@ -1,0 +1,62 @@
+"""The person at the terminal of a guided calibration, and what is looked at before anything moves."""
+
+import asyncio
+import os
+import pty
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from arm_companion.__main__ import main
+from arm_companion.cli.guide import Terminal
+from arm_companion.clock import precise_loop
+from arm_companion.drivers import calibration_files as files
+
+
+def refused(capsys: pytest.CaptureFixture[str], *words: str, code: int = 2) -> str:
+    assert main(["calibrate", *words, "--config", "sim.toml"]) == code
+    return capsys.readouterr().err
+
+
+def test_an_enter_from_before_the_question_does_not_answer_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    keys, end = pty.openpty()
+
+    async def answer() -> tuple[str | None, str | None]:
+        terminal, early = Terminal(), None
+        os.write(keys, b"\n\n")  # while the servo still moved
+        await asyncio.sleep(0.05)
+        with suppress(TimeoutError):
+            async with asyncio.timeout(0.2):
+                early = await terminal.ask("Take the weight off: the torque goes off now.", sure=False)
+        asking = asyncio.create_task(terminal.ask("And now?", sure=False))
+        await asyncio.sleep(0.05)
+        os.write(keys, b"no\n")
+        return early, await asking
+
+    with os.fdopen(end, encoding="utf-8") as stdin, asyncio.Runner(loop_factory=precise_loop) as runner:
+        monkeypatch.setattr("sys.stdin", stdin)
+        early, late = runner.run(answer())
+    os.close(keys)
+    assert early is None
+    assert late == "no"
+
+
+@pytest.mark.parametrize("what", ["tendons", "tension"])
+def test_a_place_where_nothing_can_be_kept_is_told_before_anything_is_measured(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str
+) -> None:
+    (tmp_path / "file").write_text("not a directory", encoding="utf-8")
+    here = ("--yes", "--set", f"servos.port={tmp_path / 'none'}", "--directory")
+    assert "cannot be written" in refused(capsys, what, *here, str(tmp_path / "file" / "state"))
+    (tmp_path / files.TENSION).write_text("{", encoding="utf-8")
+    expected = "remove it first" if what == "tension" else "cannot open"
+    assert expected in refused(capsys, what, *here, str(tmp_path))
+
+
+def test_an_arm_whose_servos_do_not_suit_its_tendons_is_refused_before_it_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    three = ("--set", "arm.tendons.angles_deg=[0.0, 120.0, 240.0]")
+    text = refused(capsys, "tendons", "--yes", "--directory", str(tmp_path), *three, code=78)
+    assert "4 entries for 3 tendons" in text
