@@ -1,4 +1,8 @@
-"""A terminal whose keys arrive one by one, given back as it was whatever happens."""
+"""A terminal whose keys arrive one by one, given back as it was whatever happens.
+
+The loop that drives the arm shows its screen in between, so nothing here waits for the terminal: Ctrl-S or a link that
+stalls costs pictures, and not the cycles that keep the servos' watchdogs content.
+"""
 
 import asyncio
 import contextlib
@@ -33,6 +37,10 @@ class Keyboard:
     def __enter__(self) -> Self:
         self._before = termios.tcgetattr(self._keys)
         tty.setcbreak(self._keys)
+        mode = termios.tcgetattr(self._keys)
+        mode[0] &= ~termios.IXON  # Ctrl-S is a key like others
+        termios.tcsetattr(self._keys, termios.TCSANOW, mode)
+        self._display = _unblocked(self._display)
         asyncio.get_running_loop().add_reader(self._keys, self._read)
         self._write(_OPEN_SCREEN)
         return self
@@ -42,9 +50,10 @@ class Keyboard:
     ) -> None:
         asyncio.get_running_loop().remove_reader(self._keys)
         self._write(_CLOSE_SCREEN)
+        os.close(self._display)
         if self._before is not None:
             with contextlib.suppress(OSError, termios.error):  # the terminal may be gone
-                termios.tcsetattr(self._keys, termios.TCSADRAIN, self._before)
+                termios.tcsetattr(self._keys, termios.TCSANOW, self._before)  # whatever it has not shown yet
 
     def show(self, text: str) -> None:
         """Replace what the screen shows."""
@@ -67,3 +76,11 @@ class Keyboard:
             pass  # a slow terminal misses a picture
         except OSError:
             self._receiver(b"")
+
+
+def _unblocked(display: int) -> int:
+    """Another descriptor of a terminal, whose writes do not wait; the mode of the given one is the shell's too."""
+    try:
+        return os.open(os.ttyname(display), os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:  # of another user, or without a name here
+        return os.dup(display)

@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import dataclasses
 import json
+import signal
 import sys
 from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
@@ -179,7 +180,14 @@ def _agreed() -> bool:
     if not sys.stdin.isatty():
         print("nobody to ask: --yes writes it")
         return False
-    return input("Write this? [y/N] ").strip().lower() in {"y", "yes"}
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # the loop's own waits for the line to end
+    try:
+        return input("Write this? [y/N] ").strip().lower() in {"y", "yes"}
+    except EOFError:
+        print()
+        return False
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 # monitor

@@ -7,6 +7,7 @@ import pty
 import signal
 import sys
 import termios
+import tty
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
@@ -209,6 +210,38 @@ def test_losing_the_terminal_in_the_middle_of_a_move_holds_the_arm(tmp_path: Pat
             assert servos.positions() == pytest.approx(held, abs=30), "nothing moves on"
             assert held[0] - held[2] > 100
             assert all(servo.peek(ct.TORQUE_ENABLE) == 1 for servo in servos.servos)
+
+    with asyncio.Runner(loop_factory=precise_loop) as runner:
+        runner.run(main())
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("stall", ["Ctrl-S", "link"])
+def test_a_terminal_that_takes_no_more_does_not_stop_the_cycles(tmp_path: Path, stall: str) -> None:
+    """Then the servos' watchdogs would stop them in the middle of a move."""
+    servos = emulator()
+
+    async def main() -> None:
+        async with jogging(tmp_path / "bus", servos) as session:
+            await session.see("q quit")
+            if stall == "Ctrl-S":
+                session.type(b"\x13")
+            else:
+                asyncio.get_running_loop().remove_reader(session.master)
+                tty.setraw(session.slave, termios.TCSANOW)
+                os.set_blocking(session.slave, False)
+                with suppress(BlockingIOError):
+                    while True:
+                        os.write(session.slave, b"." * 256)
+                os.set_blocking(session.slave, True)
+            session.type(b"+++w")
+            await asyncio.sleep(1.8)  # longer than the watchdogs wait
+            assert all(servo.peek(ct.BUS_WATCHDOG) == 25 for servo in servos.servos)
+            assert servos.positions()[0] - servos.positions()[2] > 500
+            session.type(b"q")
+            if stall == "link":
+                asyncio.get_running_loop().add_reader(session.master, session._read)
+            assert await session.end() == 0
 
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         runner.run(main())

@@ -4,6 +4,7 @@ import asyncio
 import dataclasses
 import json
 import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import TextIO
@@ -207,6 +208,30 @@ def test_setup_asks_a_person(
     new = bench.new(0)
     assert call("setup") == 0
     assert (new.baud == 1_000_000) == done
+
+
+@pytest.mark.parametrize("key", ["\x03", "\x04"])
+def test_setup_takes_an_interrupt_and_the_end_of_input_for_a_no(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, key: str
+) -> None:
+    typed = iter((key, "y"))
+
+    def ask(_: str) -> str:
+        match next(typed):
+            case "\x03":
+                signal.raise_signal(signal.SIGINT)
+                return ask(_)  # whoever does not end there goes on reading
+            case "\x04":
+                raise EOFError
+        return "y"
+
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", ask)
+    before, handler = settings(bench.new(0)), signal.getsignal(signal.SIGINT)
+    assert call("setup") == (130 if key == "\x03" else 0)
+    assert settings(bench.emulator.servos[0]) == before
+    assert next(typed) == "y", "it was asked no further"
+    assert signal.getsignal(signal.SIGINT) is handler
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
