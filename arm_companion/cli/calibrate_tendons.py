@@ -16,6 +16,7 @@ from arm_companion.drivers import calibration_files as files
 from arm_companion.drivers.calibration import VERSION, Progress, ServoIdentity, curves, identity, made_of
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.procedures.tendon_zeros import Found, Options, Setup, Zero, least_slack, procedure
+from arm_companion.protocol.control_table import TICKS_PER_TURN
 from arm_companion.workshop.rig import Rig, m_per_tick
 
 _PROGRESS = "tendons.progress.json"
@@ -62,8 +63,11 @@ def run(arguments: argparse.Namespace, config: Config) -> int:
         known = tuple(identity(bus.info[servo]) for servo in config.servos.ids)
         terminal.say("\n".join(f"tendon {i + 1}: {servo}" for i, servo in enumerate(known)))
         setup = _setup(config, directory, options)
-        done = () if arguments.restart else await _resumed(directory, known, bus, config, terminal)
-        zeros = await rig.run(procedure(setup, done), terminal, lambda found: _keep(directory, known, config, found))
+        stand = tuple(state.position for state in await bus.read())
+        done = () if arguments.restart else await _resumed(directory, known, stand, bus, config, terminal)
+        zeros = await rig.run(
+            procedure(setup, done), terminal, lambda found: _keep(directory, known, stand, config, found)
+        )
         _store(directory, config, known, zeros, {state.id: state.position for state in await bus.read()})
         for i, zero in enumerate(zeros):
             terminal.say(f"tendon {i + 1}: zero at {zero.ticks} ticks, give or take {1e3 * zero.sigma:.2f} mm")
@@ -112,7 +116,12 @@ def _setup(config: Config, directory: Path, options: Options) -> Setup:
 
 
 async def _resumed(
-    directory: Path, known: tuple[ServoIdentity, ...], bus: ServoBus, config: Config, terminal: Terminal
+    directory: Path,
+    known: tuple[ServoIdentity, ...],
+    stand: tuple[int, ...],
+    bus: ServoBus,
+    config: Config,
+    terminal: Terminal,
 ) -> tuple[Found, ...]:
     """What an interrupted run has found, if it still holds and the person wants it."""
     try:
@@ -129,6 +138,9 @@ async def _resumed(
         why = "the pulleys are others"
     elif any(bus.info[servo].fresh for servo in config.servos.ids):
         why = "the servos have been without power since"
+    elif any(abs(now - then) >= TICKS_PER_TURN // 2 for now, then in zip(stand, before.stood, strict=True)):
+        # a daemon that met them after a loss of power leaves them set up, and counting in another turn
+        why = "the servos stand elsewhere, and may have been without power since"
     elif unix_now() - before.made_unix_s > _PROGRESS_LASTS_S:
         why = "it is too long ago"
     if why:
@@ -141,8 +153,10 @@ async def _resumed(
     return () if line is None or line.strip().lower() in {"n", "no"} else before.found
 
 
-def _keep(directory: Path, known: tuple[ServoIdentity, ...], config: Config, found: Any) -> None:
-    _write(directory / _PROGRESS, Progress(VERSION, unix_now(), known, config.arm.pulley_radius_m, found))
+def _keep(
+    directory: Path, known: tuple[ServoIdentity, ...], stand: tuple[int, ...], config: Config, found: Any
+) -> None:
+    _write(directory / _PROGRESS, Progress(VERSION, unix_now(), known, config.arm.pulley_radius_m, stand, found))
 
 
 def _store(

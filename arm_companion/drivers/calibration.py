@@ -74,6 +74,7 @@ class Progress:
     made_unix_s: float
     servos: tuple[ServoIdentity, ...]
     pulley_radius: float  # m
+    stood: tuple[int, ...]  # ticks of each servo where the run began, and where every end of it but the hardest left it
     found: tuple[Found, ...]
 
 
