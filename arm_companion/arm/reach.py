@@ -147,7 +147,7 @@ def alone(
         else:
             lower = first
     theta = 0.5 * (lower + upper)
-    if (miss := way.miss(theta)) > tolerance:
+    if not (miss := way.miss(theta)) <= tolerance:  # also where the target is no number
         raise OutOfReach(f"the arm alone stays {miss * 100:.1f} cm away from the point")
     if (reason := way.bend_barred(theta)) is not None:
         raise OutOfReach(reason)

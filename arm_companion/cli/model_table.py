@@ -5,11 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from arm_companion.arm.allocation import allocate
+from arm_companion.arm.allocation import hold_moment
 from arm_companion.arm.model import ArmSolution
 from arm_companion.arm.stiffness import stiffness_along
 from arm_companion.config import Config
-from arm_companion.errors import ModelError
 from arm_companion.experiments.case import Case
 
 
@@ -50,11 +49,11 @@ def _pose(answer: dict[str, Any]) -> list[str]:
 
 
 def _tendons(solution: ArmSolution, asked: Case, config: Config) -> list[str]:
-    parameters = asked.model.parameters
-    try:
-        least = allocate(parameters, solution.bend, tension_min=config.limits.tension_min_n).tolist()
-    except ModelError:
-        least = [math.nan] * parameters.n
+    parameters, floor = asked.model.parameters, config.limits.tension_min_n
+    # What tendons do to the bend is H^T tension, whatever load and weight do beside: all that makes the same holds it.
+    H = parameters.H
+    found = hold_moment(H, H.T @ solution.tension, np.full(parameters.n, floor), floor, np.inf)
+    least = [math.nan] * parameters.n if found is None else found.tolist()
     lines = [f"{'tendon':<8}{'at, deg':>10}{'goal, mm':>12}{'tension, N':>12}{'servo, N m':>12}{'least, N':>12}"]
     for i in range(parameters.n):
         tension = float(solution.tension[i])
@@ -62,7 +61,7 @@ def _tendons(solution: ArmSolution, asked: Case, config: Config) -> list[str]:
             f"{i + 1:<8}{math.degrees(parameters.angles[i]):>10.1f}{1e3 * asked.pull[i]:>12.4f}{tension:>12.4f}"
             f"{tension * config.arm.pulley_radius_m:>12.4f}{least[i]:>12.4f}"
         )
-    lines.append(f"(least: the tensions that hold the same bend with none under {config.limits.tension_min_n:g} N)")
+    lines.append(f"(least: the tensions that hold the same bend under the same load with none under {floor:g} N)")
     return lines
 
 

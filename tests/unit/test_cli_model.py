@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from arm_companion.__main__ import main
+from arm_companion.arm.parameters import ArmParameters
+from arm_companion.config import load as load_config
 
 TABLES = json.loads((Path(__file__).parents[1] / "data" / "rod_reference.json").read_text(encoding="utf-8"))
 L = 0.25
@@ -224,6 +226,19 @@ def test_tensions(ask: Asker, row: dict[str, Any]) -> None:
     answer = ask.json("tensions", *bend)
     assert np.allclose(answer["tension_n"], row["tau_bvp"], atol=5e-6)
     assert np.linalg.norm(answer["tip_position_m"] - row["tip_p"]) < 1e-6 * L
+
+
+@pytest.mark.parametrize("load", [(), ("--force", 1, 0, 0), ("--gravity", "--payload-kg", 0.05)])
+def test_the_least_tensions_hold_the_loaded_arm_where_it_is(ask: Asker, load: tuple[object, ...]) -> None:
+    arm = ArmParameters.of(load_config("zhao2022.toml").arm)
+    code, text, _ = ask.code("tensions", "--theta-deg", 30, *load)
+    assert code == 0
+    table = np.array([line.split()[1:] for line in text.splitlines() if line[:1] in set("1234")], dtype=float)
+    goals, tension, least = table[:, 1] * 1e-3, table[:, 2], table[:, 4]
+    before = ask.json("tensions", "--theta-deg", 30, *load)
+    eased = ask.json("tensions", "--pull-m", *(goals + (least - tension) / arm.k_T), *load)
+    assert np.allclose(eased["tension_n"], least, atol=0.01)
+    assert eased["tip_position_m"] == pytest.approx(before["tip_position_m"], abs=2e-5)
 
 
 @pytest.mark.parametrize("row", [r for r in TABLES["stiffness_test"] if r["F"] in (0.3924, 0.981)])

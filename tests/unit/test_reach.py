@@ -129,6 +129,8 @@ def test_an_arm_alone_refuses_what_lies_off_its_surface() -> None:
     with pytest.raises(OutOfReach, match=r"3\.0 cm away"):
         alone(target, HERE, 0.0, BELOW, STRAIGHT, FREE, 0.02)
     assert alone(target, HERE, 0.0, BELOW, STRAIGHT, FREE, 0.04).miss == pytest.approx(0.03)
+    with pytest.raises(OutOfReach):
+        alone(np.full(3, np.nan), HERE, 0.0, BELOW, STRAIGHT, FREE, 0.02)
 
 
 @given(
