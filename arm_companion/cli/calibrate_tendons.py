@@ -68,9 +68,9 @@ def run(arguments: argparse.Namespace, config: Config) -> int:
         zeros = await rig.run(
             procedure(setup, done), terminal, lambda found: _keep(directory, known, stand, config, found)
         )
-        _store(directory, config, known, zeros, {state.id: state.position for state in await bus.read()})
         for i, zero in enumerate(zeros):
             terminal.say(f"tendon {i + 1}: zero at {zero.ticks} ticks, give or take {1e3 * zero.sigma:.2f} mm")
+        _store(directory, config, known, zeros, {state.id: state.position for state in await bus.read()})
         terminal.say(f"stored in {directory / files.TENDONS}")
         return True
 

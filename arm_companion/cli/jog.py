@@ -77,8 +77,7 @@ async def _jog(config: Config, speed: float, *, torque_off: bool) -> tuple[int, 
         await bench.start()
         with Keyboard(sys.stdin.fileno(), sys.stdout.fileno(), bench.typed) as keyboard:
             await bench.serve(keyboard)
-        if torque_off and bench.asked_to_quit:
-            await bench.straighten()
+        if torque_off and bench.asked_to_quit and await bench.straighten():
             await bus.limp()
             return 0, "the arm is limp"
     except* LinkError as errors:
@@ -165,19 +164,21 @@ class Bench:
                 keyboard.show(self._screen(states))
             shown += 1
 
-    async def straighten(self) -> None:
-        """Slowly straight.
+    async def straighten(self) -> bool:
+        """Slowly straight; whether it got there, which a signal ends.
 
         Raises:
             DeviceFault: a servo failed on the way.
         """
+        self._ended.clear()
         self._jog = press(self._jog, Key.RELAX)
         async for _ in ticks(1.0 / self._config.rates.cycle_hz):
             for state in await self._cycle():
                 if (fault := state.fault) is not None:
                     raise fault
-            if self._jog.bend == self._jog.goal:
-                return
+            if self._ended.is_set() or self._jog.bend == self._jog.goal:
+                break
+        return not self._ended.is_set()
 
     async def _cycle(self) -> tuple[ServoState, ...]:
         states = await self._bus.read()

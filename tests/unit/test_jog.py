@@ -131,7 +131,7 @@ class Session:
 
 
 @asynccontextmanager
-async def jogging(port: Path, emulator: ServoEmulator) -> AsyncIterator[Session]:
+async def jogging(port: Path, emulator: ServoEmulator, *options: str) -> AsyncIterator[Session]:
     config = load("sim.toml", (f"servos.port={port}", *SETTINGS))
     bus = EmulatedBus(emulator, config.servos)
     master, slave = pty.openpty()
@@ -142,7 +142,7 @@ async def jogging(port: Path, emulator: ServoEmulator) -> AsyncIterator[Session]
         words = [word for setting in (f"servos.port={port}", *SETTINGS) for word in ("--set", setting)]
         process = await asyncio.create_subprocess_exec(
             sys.executable,
-            *("-m", "arm_companion", "jog", "--config", "sim.toml", "--speed-deg-s", "40", *words),
+            *("-m", "arm_companion", "jog", "--config", "sim.toml", "--speed-deg-s", "40", *words, *options),
             stdin=slave,
             stdout=slave,
             stderr=slave,
@@ -210,6 +210,29 @@ def test_losing_the_terminal_in_the_middle_of_a_move_holds_the_arm(tmp_path: Pat
             assert servos.positions() == pytest.approx(held, abs=30), "nothing moves on"
             assert held[0] - held[2] > 100
             assert all(servo.peek(ct.TORQUE_ENABLE) == 1 for servo in servos.servos)
+
+    with asyncio.Runner(loop_factory=precise_loop) as runner:
+        runner.run(main())
+
+
+@pytest.mark.realtime
+@pytest.mark.parametrize("stopped", [True, False])
+def test_an_interrupt_stops_the_way_to_straight_and_the_arm_is_not_let_go(tmp_path: Path, stopped: bool) -> None:
+    servos = emulator()
+
+    async def main() -> None:
+        async with jogging(tmp_path / "bus", servos, "--torque-off") as session:
+            await session.see("q quit")
+            session.type(b"+++ww")
+            await asyncio.sleep(1.8)
+            session.type(b"q")
+            await asyncio.sleep(0.3)
+            if stopped:
+                session.process.send_signal(signal.SIGINT)
+            assert await session.end() == 0
+            await session.see("the servos hold" if stopped else "the arm is limp")
+            assert [servo.peek(ct.TORQUE_ENABLE) for servo in servos.servos] == [int(stopped)] * 4
+            assert (abs(servos.positions()[0] - servos.positions()[2]) > 500) is stopped
 
     with asyncio.Runner(loop_factory=precise_loop) as runner:
         runner.run(main())
