@@ -31,6 +31,7 @@ _GUESS = {POSITION: 1e-3, SHIFT: 1e-3, TENSION: 0.3}  # scatter to begin with
 _ROUNDS = 4  # of weights
 _LOOK = 1e-3  # of a parameter, for derivatives
 _FACTOR = math.log(20)  # by which a parameter may leave its configured value
+_SURPRISING = math.log(2.5)  # from which on people are told; pounds, kilograms and radians are farther off
 _MU_MAX = 2.0
 _USELESS = 0.5  # one sigma, relative, above which a parameter is not told by the test
 _MU_USELESS = 0.2
@@ -124,7 +125,7 @@ class Fit:
         measured: values.
         predicted: by the fit.
         degrees: of freedom.
-        notes: what was held fixed, and why.
+        notes: what was held fixed, and why, and what should be looked at twice.
     """
 
     estimates: Mapping[str, Estimate]
@@ -187,6 +188,11 @@ def fit(
             solved = _judged(judge, x)
         x = solved.x
     _check(problem, solved)
+    notes += [
+        f"{name} is {math.exp(value):.2g} times what is configured: {_SUSPECTS}"
+        for name, value in solved.x.items()
+        if name != "mu" and abs(value) > _SURPRISING
+    ]
     return _result(problem, solved, before, notes)
 
 

@@ -21,6 +21,7 @@ from arm_companion.errors import ArmError, ConfigError
 from arm_companion.experiments import case, loading_csv
 
 _UNITS = {"EI": "N m^2", "k_T": "N/m", "T0": "N", "mu": ""}
+_FULL_TURN_DEG = 360.0
 _KEYS = {"EI": "EI_n_m2", "k_T": "k_T_n_per_m", "T0": "T0_n", "mu": "mu"}
 
 
@@ -105,6 +106,8 @@ def _stiffness(arguments: argparse.Namespace, config: Config) -> int:
         raise _RefusedError("--figure needs 'matplotlib': pip install 'arm-companion[sim]'")
     if arguments.output is not None and arguments.settings:
         raise _RefusedError("--output extends the configuration file: put what --set changes into that file")
+    if not all(abs(angle) <= _FULL_TURN_DEG for angle in arguments.attitude_deg or ()):
+        raise _RefusedError(f"--attitude-deg takes angles up to {_FULL_TURN_DEG:g}")
     if config.arm.segments:
         raise _RefusedError(f"a loading test is fitted for one segment, and this arm has {len(config.arm.chain)}")
     if arguments.output is not None and arguments.output.resolve() == arguments.data.resolve():

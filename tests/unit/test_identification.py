@@ -238,6 +238,15 @@ def test_data_that_contradict_the_model_give_no_numbers(
         ident.fit(nominal, changed(exact, **wrong), ("EI", "k_T", "T0"))
 
 
+def test_a_parameter_far_from_the_configured_one_is_told(nominal: ArmParameters, exact: tuple[Reading, ...]) -> None:
+    """Loads in pounds, and positions alone: a soft arm would show much the same."""
+    pounds = changed(exact, follower=lambda r: r.follower / 4.448, tension=lambda _: np.full(4, math.nan))
+    fit = ident.fit(nominal, pounds, ("EI",))
+    assert any(note.startswith("EI is 0.") and "check units" in note for note in fit.notes)
+    right = changed(exact, tension=lambda _: np.full(4, math.nan))
+    assert not any("check units" in note for note in ident.fit(nominal, right, ("EI",)).notes)
+
+
 # --- the file and the command ---
 
 HEADER = "run,theta_deg,follower_x_n,x_m,y_m,z_m,tension_1_n,tension_2_n,tension_3_n,tension_4_n"
@@ -360,6 +369,7 @@ def test_servo_stiffness_in_series_is_kept_unless_it_contradicts(tmp_path: Path,
         (["good.csv", "--fit", "EI,beta"], "no such parameter: beta"),
         (["good.csv", "--output", "a.toml", "--set", "arm.disks=9"], "--set"),
         (["good.csv"], "measured values for 4 parameters"),
+        (["good.csv", "--attitude-deg", "nan", "0", "0"], "--attitude-deg"),
     ],
 )
 def test_refusals_of_the_command(
