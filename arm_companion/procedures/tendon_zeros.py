@@ -35,6 +35,7 @@ _LEAD = 10  # samples in which a servo starts or stops
 _CLEAR_M = 0.001
 _LEAST_TAUT = 50  # samples
 _LEAST_SHARE = 0.2  # of the pretension, that every tendon must have when all are taken up
+_FELT = 1.5  # N, least pretension that stands out from friction and noise of a load
 _STIFFNESS_SPREAD = 0.2  # relative, of the tendons' stiffness
 _LEVEL_READINGS = 300  # about as many tell the load of a slack servo
 _LET_OUT_TRIES = 3
@@ -110,6 +111,11 @@ def procedure(setup: Setup, done: tuple[Found, ...] = ()) -> Procedure[tuple[Zer
     Raises:
         Refused: something is not as it should be.
     """
+    if (least := float(setup.arm.T0.min())) < _FELT:
+        raise Refused(
+            f"arm.tendons.pretension_n is {least:g}: under {_FELT:g} N are not felt through the gears of a servo; "
+            "set more, or servos.zero_ticks by hand"
+        )
     yield Ask(
         "The arm must hang straight down by itself, free to bend, the vehicle level and its propellers off.\n"
         "Torque comes on now; every servo stays where it is."

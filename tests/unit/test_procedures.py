@@ -179,6 +179,16 @@ def test_a_tendon_that_never_pulls_is_refused_by_name() -> None:
         Arithmetic(broken).run(procedure(SETUP))
 
 
+@pytest.mark.parametrize("pretension", [0.0, 1.0])
+def test_a_pretension_that_no_servo_feels_is_refused_before_anything_moves(pretension: float) -> None:
+    """After all tendons had been taken up it was called a caught tendon."""
+    loose = dataclasses.replace(ARM, tendons=tuple(dataclasses.replace(t, T0=pretension) for t in ARM.tendons))
+    bench = Arithmetic(hanging(ZEROS))
+    with pytest.raises(Refused, match="pretension_n"):
+        bench.run(procedure(dataclasses.replace(SETUP, arm=loose)))
+    assert not bench.asked
+
+
 def test_an_arm_that_bends_elsewhere_is_refused() -> None:
     bench = Arithmetic(hanging(ZEROS))
     bench.no_to = "bent towards tendon 2"
