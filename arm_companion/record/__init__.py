@@ -1,7 +1,7 @@
 """The record of a flight: an MCAP file that today's code can be run against, and that Foxglove and PlotJuggler read."""
 
 import importlib.util
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Final
 
@@ -53,8 +53,21 @@ def configured_recorder(config: Config, clock: Clock) -> Recorder:
         path = Path(config.record.file)
     else:
         start = datetime.fromtimestamp(clock.unix(clock.now()), UTC)
-        path = Path(config.record.directory) / f"{start:%Y%m%d-%H%M%S}.mcap"
+        path = _free_name(Path(config.record.directory), start)
     return open_recorder(path, config, clock)
+
+
+def _free_name(directory: Path, start: datetime) -> Path:
+    """A second later where there is a record already: a computer without a clock may start at the same time again."""
+    while True:
+        path = directory / f"{start:%Y%m%d-%H%M%S}.mcap"
+        try:
+            taken = path.exists() or any(directory.glob(f"{path.stem}-*{path.suffix}"))
+        except OSError:  # the recorder will tell of it
+            return path
+        if not taken:
+            return path
+        start += timedelta(seconds=1)
 
 
 def open_recorder(path: Path, config: Config, clock: Clock, *, patient: bool = False) -> Recorder:

@@ -131,9 +131,10 @@ class FileRecorder(Recorder):
         # what follows is the thread's alone
         self._file: McapFile | None = None
         self._parts = 0
+        self._given = 0  # cycles of the present file, or of the one that is to be opened
         self._begun = ""
         self._config: Config | None = None
-        self._synced = self._retry_at = float("-inf")
+        self._now = self._synced = self._retry_at = float("-inf")
         self._failing = False
         self._hurry = threading.Event()
         self._breath = threading.Event()  # never set
@@ -262,7 +263,7 @@ class FileRecorder(Recorder):
             try:
                 self._take(batch)
             except OSError as error:
-                self._fail(batch, error)
+                self._fail(error)
             except Exception:
                 log.exception("record: cycles could not be written")
                 self._lose(len(batch.cycles))
@@ -278,11 +279,15 @@ class FileRecorder(Recorder):
         t = batch.t
         if t is None:
             return
+        self._now = t
         if self._file is None:
             if t < self._retry_at:
                 self._lose(len(batch.cycles))
                 return
+            self._given = len(batch.cycles)
             self._next_part(t)
+        else:
+            self._given += len(batch.cycles)
         file = self._file
         if file is None:
             return
@@ -294,7 +299,7 @@ class FileRecorder(Recorder):
             self._synced = t
             file.sync()
             if storage.free_mb(self._first.parent) < self._options.keep_free_mb:
-                self._make_room()
+                self._make_room(storage.part(self._first, self._parts))
 
     def _write(self, file: McapFile, batch: _Batch) -> None:
         for t, config in batch.configs:
@@ -322,45 +327,55 @@ class FileRecorder(Recorder):
 
     def _next_part(self, t: float) -> None:
         self._first.parent.mkdir(parents=True, exist_ok=True)
-        self._parts += 1
-        self._make_room()
+        path = storage.part(self._first, self._parts + 1)
+        self._make_room(path)
+        goes_on = bool(self._begun)
         self._begun = self._begun or str(self._ns(t))  # ties the parts together
-        path = storage.part(self._first, self._parts)
-        self._file = self._open_file(path, {**self._versions, "part": str(self._parts), "begun": self._begun})
+        self._file = self._open_file(path, {**self._versions, "part": str(self._parts + 1), "begun": self._begun})
+        self._parts += 1
         self._synced = t
-        if self._config is not None and self._parts > 1:
+        if self._config is not None and goes_on:
             self._write_config(self._file, t, self._config)
         if self._failing:
             self._failing = False
             self._troubles.append(f"record: goes on in {path.name}, {self.dropped} cycles are missing")
 
-    def _make_room(self) -> None:
-        present = storage.part(self._first, self._parts)
+    def _make_room(self, present: Path) -> None:
         options = self._options
         for file in storage.make_room(self._first, present, options.budget_mb, options.keep_free_mb):
             log.info("record: %s deleted, the disk budget is used up", file)
         if storage.free_mb(self._first.parent) < options.keep_free_mb:
+            self._finish()
             raise OSError(f"less than {options.keep_free_mb:g} MB are free")
 
-    def _fail(self, batch: _Batch, error: OSError) -> None:
-        self._lose(len(batch.cycles))
-        if self._file is not None:
-            self._file.abandon()
-            self._file = None
-        self._retry_at = (batch.t or 0.0) + _RETRY_S
+    def _fail(self, error: OSError) -> None:
+        self._abandon()
+        self._retry_at = self._now + _RETRY_S
         if not self._failing:
             self._failing = True
             self._troubles.append(f"record stopped: {error.strerror or error}")
 
     def _finish(self) -> None:
-        file, self._file = self._file, None
+        file = self._file
         if file is None:
             return
         try:
             file.close()
         except OSError as error:
-            file.abandon()
+            self._abandon()
             self._troubles.append(f"record: its last cycles are lost: {error.strerror or error}")
+        self._file, self._given = None, 0
+
+    def _abandon(self) -> None:
+        """Leave the present file, or give up the one that could not be opened, without what is not in a whole chunk."""
+        file, self._file = self._file, None
+        saved = 0
+        if file is not None:
+            file.abandon()
+            saved = file.count(FACTS)
+            self._parts -= not saved  # a reader looks for part after part, and the next try takes the same file
+        self._lose(self._given - saved)
+        self._given = 0
 
     def _ns(self, t: float) -> int:
         return round(self._unix(t) * 1e9)

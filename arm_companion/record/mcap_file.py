@@ -90,6 +90,10 @@ class McapFile:
         """Bytes so far, without the open chunk."""
         return self._stream.tell()
 
+    def count(self, topic: str) -> int:
+        """Messages of a channel in whole chunks."""
+        return self._counts.get(self._numbers.get(topic, 0), 0)
+
     def json(self, topic: str, unix_ns: int, value: dict[str, Any], sequence: int = 0) -> None:
         """Add a structured message."""
         self.raw(topic, unix_ns, orjson.dumps(value), sequence)

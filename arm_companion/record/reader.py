@@ -83,10 +83,19 @@ class Reader:
         yield path
         if self.versions.get("content") == "truth":
             return
-        while (path := storage.following(path)).is_file() and _versions(path).get("begun") == self.versions.get(
-            "begun"
-        ):
+        while (path := storage.following(path)).is_file():
+            try:
+                begun = _versions(path).get("begun")
+            except RecordError as error:  # the power went, or the disk was full, as it was opened
+                self._remark(str(error))
+                continue
+            if begun != self.versions.get("begun"):
+                return
             yield path
+
+    def _remark(self, text: str) -> None:
+        if text not in self.remarks:
+            self.remarks.append(text)
 
     def _part(self, path: Path, topics: Collection[str] | None) -> Iterator[Item]:
         names: dict[int, str] = {}
@@ -166,9 +175,9 @@ def _versions(path: Path) -> dict[str, str]:
                     break
         except InvalidMagic:
             raise RecordError(f"{path}: not an MCAP file") from None
-        except (McapError, EndOfFile, OSError, ValueError, ArithmeticError, LookupError):
+        except (McapError, EndOfFile, OSError, ValueError, ArithmeticError, LookupError, struct.error):
             raise RecordError(f"{path}: cut off before its first cycle") from None
-        except Exception as error:  # noqa: BLE001 - struct.error and what else damaged bytes lead to
+        except Exception as error:  # noqa: BLE001 - whatever damaged bytes lead to
             raise RecordError(f"{path}: damaged at its beginning: {error}") from None
     raise RecordError(f"{path}: an MCAP file, but not a record of arm-companion")
 
