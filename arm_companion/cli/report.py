@@ -6,6 +6,7 @@ import json
 import sys
 from pathlib import Path
 
+from arm_companion.errors import RecordError
 from arm_companion.record import require
 
 
@@ -33,9 +34,15 @@ def run(arguments: argparse.Namespace) -> int:
     from arm_companion.report.words import judge  # noqa: PLC0415
 
     log: Path = arguments.log
-    beside = truth_beside(log)
-    truth: Path | None = arguments.truth or (beside if beside.is_file() else None)
-    flight = read(Reader(log), Reader(truth) if truth is not None else None)
+    record, truth, beside = Reader(log), None, truth_beside(log)
+    if arguments.truth:
+        truth = Reader(arguments.truth)
+    elif beside.is_file():
+        try:
+            truth = Reader(beside)
+        except RecordError as error:  # the simulator was stopped as it wrote it; the flight is worth a page
+            record.remarks.append(str(error))
+    flight = read(record, truth)
     verdict = judge(flight)
     output: Path = arguments.output or log.with_suffix("")
     drawn = pictures(flight)

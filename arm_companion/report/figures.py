@@ -46,18 +46,24 @@ def pictures(flight: RecordedFlight) -> list[Picture]:
             "Tendon tensions",
             f"By load and statics; pale: by load alone{'; dotted: the truth' if flight.truth else ''}.",
             _tensions,
-            flight.tension.ndim == 2,
+            flight.tension.shape[1] > 0,
         ),
         ("position", "Vehicle", "Where it was; dotted: where it was asked to be. World axes.", _position, True),
         ("error", "Vehicle off its set-point", "While set-points were sent.", _error, True),
-        ("temperature", "Servo temperatures", "As the servos report them.", _temperature, flight.temperature.ndim == 2),
+        (
+            "temperature",
+            "Servo temperatures",
+            "As the servos report them.",
+            _temperature,
+            flight.temperature.shape[1] > 0,
+        ),
         ("links", "Age of the newest message", "Each line is one source; higher is worse.", _links, True),
         (
             "servos",
             "Servo bus",
             "Age of each servo's newest answer, and the voltage.",
             _servos,
-            flight.voltage.ndim == 2,
+            flight.voltage.shape[1] > 0,
         ),
     ]
     return [Picture(name, title, caption, _draw(flight, plan)) for name, title, caption, plan, there in plans if there]
@@ -109,8 +115,7 @@ def _tensions(axis: Axes, flight: RecordedFlight) -> None:
     for i in range(flight.tension.shape[1]):
         colour = _COLOURS[i % len(_COLOURS)]
         axis.plot(flight.t, flight.tension[:, i], color=colour, lw=0.6, alpha=0.35)
-        if flight.tension_best.ndim == 2:
-            axis.plot(flight.t, flight.tension_best[:, i], color=colour, lw=1.2, label=f"tendon {i + 1}")
+        axis.plot(flight.t, flight.tension_best[:, i], color=colour, lw=1.2, label=f"tendon {i + 1}")
         if flight.truth:
             axis.plot(flight.truth["t"], flight.truth["tension"][:, i], color=colour, lw=1.0, ls=":")
     axis.set_ylabel("tension, N")
@@ -164,6 +169,6 @@ def _servos(axis: Axes, flight: RecordedFlight) -> None:
     axis.set_ylabel("age, ms")
     axis.legend(loc="upper left", ncols=2)
     right = axis.twinx()
-    right.plot(flight.t, np.nanmin(flight.voltage, axis=1), color=_INK, lw=1.0, ls="--")
+    right.plot(flight.t, np.fmin.reduce(flight.voltage, axis=1), color=_INK, lw=1.0, ls="--")
     right.set_ylabel("lowest voltage, V (dashed)")
     right.spines["right"].set_visible(True)

@@ -1,5 +1,8 @@
 """What the report draws of a record: series at a rate that the eye can follow, and everything that was said."""
 
+import itertools
+import math
+from array import array
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -11,13 +14,28 @@ from arm_companion.config.table import from_table
 from arm_companion.errors import ConfigError, RecordError
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import ArmFault
-from arm_companion.mission.state import MOVES_VEHICLE
 from arm_companion.record.reader import Reader
-from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, LOG, TRANSITIONS, TRUTH
+from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, LOG, TRUTH, transition
+from arm_companion.report.extremes import Extremes
 
 _PERIOD_NS: Final = 50_000_000
-_FLYING: Final = frozenset(phase.name for phase in MOVES_VEHICLE)
-_NAN3: Final = [float("nan")] * 3
+_NAN3: Final = (math.nan,) * 3
+_HEAD: Final = {
+    "t": 1,
+    "position_w": 3,
+    "setpoint_w": 3,
+    "force_b": 3,
+    "force_sigma": 3,
+    "torque_b": 3,
+    "torque_sigma": 3,
+    "autopilot": 1,
+    "position": 1,
+    "attitude": 1,
+    "ground": 1,
+}
+"""A drawn cycle is a row of these numbers, and behind them as many of each of these as there are tendons."""
+_AGES: Final = ("autopilot", "position", "attitude", "ground")
+_EACH: Final = ("tension", "tension_best", "temperature", "voltage", "servo_age")
 _LEVELS: Final = {5: "critical", 4: "error", 3: "warning"}
 
 
@@ -59,6 +77,7 @@ class RecordedFlight:
     ages: dict[str, Array]  # (k,), s: heartbeat, position, attitude, ground
     spans: list[Span] = field(default_factory=list)
     said: list[Said] = field(default_factory=list)
+    most: Extremes = field(default_factory=Extremes)
     faults: list[str] = field(default_factory=list)
     truth: dict[str, Array] = field(default_factory=dict)  # with its own "t"
     versions: dict[str, str] = field(default_factory=dict)
@@ -82,7 +101,7 @@ def read(reader: Reader, truth: Reader | None = None) -> RecordedFlight:
     """
     collected = _Collected()
     try:
-        for item in reader.messages((FACTS, COMMANDS, LOG, TRANSITIONS, CONFIGURATION)):
+        for item in reader.messages((FACTS, COMMANDS, LOG, CONFIGURATION)):
             collected.take(item.topic, item.sequence, item.unix_ns, item.data)
         if not collected.rows:
             raise RecordError(f"{reader.path}: {'; '.join([*reader.remarks, 'it has no whole cycle'])}")
@@ -91,9 +110,11 @@ def read(reader: Reader, truth: Reader | None = None) -> RecordedFlight:
         version = reader.versions.get("version", "?")
         raise RecordError(f"{reader.path}: a record of version {version} that cannot be drawn: {error!r}") from None
     flight.versions = reader.versions
-    flight.remarks = list(reader.remarks)
+    flight.remarks = [*reader.remarks, *collected.remarks]
+    if reader.versions.get("part", "1") == "1":
+        flight.missing += collected.first
     if truth is not None:
-        flight.truth = _truth(truth, collected.start)
+        flight.truth = _truth(truth, flight)
     return flight
 
 
@@ -101,130 +122,148 @@ class _Collected:
     """What has been read so far."""
 
     def __init__(self) -> None:
-        self.start = 0.0
-        self.rows: list[dict[str, Any]] = []
-        self._begun = False
+        self.rows: list[array[float]] = []
+        self.remarks: list[str] = []
+        self.first = 0  # number of the first cycle
+        self._start = self._end = 0.0
         self._began_ns = self._last_ns = 0
         self._facts: tuple[int, bytes] = (-1, b"")
         self._said: list[tuple[int, str, str]] = []
         self._moves: list[tuple[float, str, str]] = []
+        self._most = Extremes()
         self._config: Config | None = None
-        self._config_error = ""
         self._cycles = self._missing = 0
         self._next: int | None = None
-        self._first_state = ""
 
     def take(self, topic: str, sequence: int, unix_ns: int, data: bytes) -> None:
         """Take one message."""
         if topic == FACTS:
             self._facts = (sequence, data)
         elif topic == COMMANDS:
-            self._cycle(sequence, unix_ns, data)
+            if self._facts[0] == sequence:
+                self._cycle(sequence, unix_ns, orjson.loads(self._facts[1]), orjson.loads(data))
         elif topic == LOG:
             table = orjson.loads(data)
             self._said.append((unix_ns, _LEVELS.get(table["level"], "info"), table["message"]))
-        elif topic == TRANSITIONS:
-            table = orjson.loads(data)
-            self._moves.append((float(table["t"]), table["after"], table["cause"]))
         elif self._config is None:
             try:
                 self._config = from_table(orjson.loads(data)["config"], "recorded configuration")
             except ConfigError as error:
-                self._config_error = str(error)
+                self.remarks = [f"limits are not looked at: {error}"]
 
-    def _cycle(self, sequence: int, unix_ns: int, data: bytes) -> None:
+    def _cycle(self, sequence: int, unix_ns: int, facts: dict[str, Any], commands: dict[str, Any]) -> None:
+        t = self._end = float(commands["t"])
+        if self._next is None:
+            self.first = self._next = sequence
+            self._start, self._began_ns = t, unix_ns
         self._cycles += 1
-        self._missing += 0 if self._next is None else sequence - self._next
+        self._missing += sequence - self._next
         self._next = sequence + 1
-        if self._begun and unix_ns - self._last_ns < _PERIOD_NS:
-            return
-        if self._facts[0] != sequence:
-            return
-        facts, commands = orjson.loads(self._facts[1]), orjson.loads(data)
-        if not self._begun:
-            self._begun = True
-            self.start, self._began_ns = float(facts["t"]), unix_ns
-            self._first_state = commands["status"]["state"]
-        self._last_ns = unix_ns
-        self.rows.append({"facts": facts, "commands": commands})
+        self._follow(t, commands)
+        self._most.see(facts, commands)
+        if not self.rows or unix_ns - self._last_ns >= _PERIOD_NS:
+            self._last_ns = unix_ns
+            self.rows.append(_row(facts, commands))
+
+    def _follow(self, t: float, commands: dict[str, Any]) -> None:
+        """Which state it is: every cycle tells it, and the one that entered it why."""
+        state = commands["status"]["state"]
+        for notice in commands["notices"]:
+            change = transition(notice["text"])
+            if change is not None and change[1] == state:
+                self._moves.append((t, state, change[2]))
+        if not self._moves or self._moves[-1][1] != state:
+            self._moves.append((t, state, "not in the record" if self._moves else "start of the record"))
 
     def flight(self) -> RecordedFlight:
         """The series."""
-        facts = [row["facts"] for row in self.rows]
-        commands = [row["commands"] for row in self.rows]
-        vehicle = [f["vehicle"] for f in facts]
-        wrench = [c["wrench"] for c in commands]
+        count = max(len(row) - sum(_HEAD.values()) for row in self.rows) // len(_EACH)
+        series = _columns(self.rows, count)
         return RecordedFlight(
-            t=_array([f["t"] for f in facts]) - self.start,
-            position_w=_array([v["position_w"] for v in vehicle]),
-            setpoint_w=_array([c["setpoint"]["position_w"] if c["setpoint"] else _NAN3 for c in commands]),
-            force_b=_array([w["force_b"] if w["valid"] else _NAN3 for w in wrench]),
-            force_sigma=_array([w["force_sigma"] for w in wrench]),
-            torque_b=_array([w["torque_b"] if w["valid"] else _NAN3 for w in wrench]),
-            torque_sigma=_array([w["torque_sigma"] for w in wrench]),
-            tension=_array([[x["tension"] for x in f["tendons"]] for f in facts]),
-            tension_best=_array([[x["tension"] for x in c["tensions"]] for c in commands]),
-            temperature=_array([[_heard(x, "temperature") for x in f["tendons"]] for f in facts]),
-            voltage=_array([[_heard(x, "voltage") for x in f["tendons"]] for f in facts]),
-            servo_age=_array([[x["age_s"] for x in f["tendons"]] for f in facts]),
-            ages={
-                "autopilot": _array([v["heartbeat_age_s"] for v in vehicle]),
-                "position": _array([v["position_age_s"] for v in vehicle]),
-                "attitude": _array([v["attitude_age_s"] for v in vehicle]),
-                "ground": _array([f["ground_age_s"] for f in facts]),
-            },
-            spans=self._spans(float(facts[-1]["t"])),
+            t=series["t"][:, 0] - self._start,
+            position_w=series["position_w"],
+            setpoint_w=series["setpoint_w"],
+            force_b=series["force_b"],
+            force_sigma=series["force_sigma"],
+            torque_b=series["torque_b"],
+            torque_sigma=series["torque_sigma"],
+            tension=series["tension"],
+            tension_best=series["tension_best"],
+            temperature=series["temperature"],
+            voltage=series["voltage"],
+            servo_age=series["servo_age"],
+            ages={name: series[name][:, 0] for name in _AGES},
+            spans=self._spans(),
             said=[Said((ns - self._began_ns) * 1e-9, level, text) for ns, level, text in self._said],
-            faults=_faults(commands),
+            most=self._most,
+            faults=_faults(self._most.error_bits),
             config=self._config,
             cycles=self._cycles,
             missing=self._missing,
             began_ns=self._began_ns,
         )
 
-    def _spans(self, end: float) -> list[Span]:
-        # where recording began with the phase already entered there is no cause
-        first = self._moves[0] if self._moves else None
-        moves = list(self._moves)
-        if first is None or first[0] > self.start:
-            moves.insert(0, (self.start, self._first_state, "start of the record"))
-        times = [t for t, _, _ in moves[1:]] + [end]
+    def _spans(self) -> list[Span]:
+        times = [t for t, _, _ in self._moves[1:]] + [self._end]
         return [
-            Span(name, t - self.start, after - self.start, cause)
-            for (t, name, cause), after in zip(moves, times, strict=True)
+            Span(name, t - self._start, after - self._start, cause)
+            for (t, name, cause), after in zip(self._moves, times, strict=True)
         ]
 
 
-def _array(values: list[Any]) -> Array:
-    """Rows of numbers; what is not finite stands as text in the record, ragged rows are filled with nan."""
-    width = max((len(v) for v in values if isinstance(v, list)), default=0)
-    if width:
-        values = [v if len(v) == width else [*v, *[float("nan")] * (width - len(v))] for v in values]
-    try:
-        return np.array(values, dtype=float)
-    except ValueError:
-        numbers = [[float(x) for x in v] if isinstance(v, list) else float(v) for v in values]
-        return np.array(numbers, dtype=float)
+def _row(facts: dict[str, Any], commands: dict[str, Any]) -> "array[float]":
+    """What is drawn of a cycle; what is not finite stands as text in the record."""
+    vehicle, wrench, setpoint, tendons = facts["vehicle"], commands["wrench"], commands["setpoint"], facts["tendons"]
+    best = [x["tension"] for x in commands["tensions"]]
+    numbers = (
+        commands["t"],
+        *(vehicle["position_w"] if isinstance(vehicle["position_age_s"], float) else _NAN3),
+        *(setpoint["position_w"] if setpoint else _NAN3),
+        *(wrench["force_b"] if wrench["valid"] else _NAN3),
+        *wrench["force_sigma"],
+        *(wrench["torque_b"] if wrench["valid"] else _NAN3),
+        *wrench["torque_sigma"],
+        *(vehicle[f"{name}_age_s"] for name in ("heartbeat", "position", "attitude")),
+        facts["ground_age_s"],
+        *(_heard(x, "tension") for x in tendons),
+        *(best if len(best) == len(tendons) else (math.nan,) * len(tendons)),
+        *(_heard(x, "temperature") for x in tendons),
+        *(_heard(x, "voltage") for x in tendons),
+        *(x["age_s"] for x in tendons),
+    )
+    return array("d", map(float, numbers))
+
+
+def _columns(rows: "list[array[float]]", count: int) -> dict[str, Array]:
+    """The rows by name, each (k, width); where a row has fewer tendons than `count` the rest is nan."""
+    width = sum(_HEAD.values())
+    head = np.array([row[:width] for row in rows])
+    each = np.full((len(rows), len(_EACH), count), math.nan)
+    for i, row in enumerate(rows):
+        own = np.array(row[width:]).reshape(len(_EACH), -1)
+        each[i, :, : own.shape[1]] = own
+    ends = itertools.accumulate(_HEAD.values())
+    found = {name: head[:, end - wide : end] for (name, wide), end in zip(_HEAD.items(), ends, strict=True)}
+    return found | {name: each[:, i, :] for i, name in enumerate(_EACH)}
 
 
 def _heard(tendon: dict[str, Any], name: str) -> Any:
     """A servo's value, once there has been one."""
-    return tendon[name] if isinstance(tendon["age_s"], float) else float("nan")
+    return tendon[name] if isinstance(tendon["age_s"], float) else math.nan
 
 
-def _faults(commands: list[dict[str, Any]]) -> list[str]:
-    """Names of all error bits that were seen while the arm flew a perch."""
-    bits = 0
-    for table in commands:
-        if table["status"]["state"] in _FLYING:
-            bits |= table["status"]["error_bits"]
+def _faults(bits: int) -> list[str]:
+    """Names of error bits."""
     return [fault.name.replace("_", " ").lower() for fault in ArmFault if fault.name and fault.value & bits]
 
 
-def _truth(reader: Reader, start: float) -> dict[str, Array]:
-    rows = [orjson.loads(item.data) for item in reader.messages((TRUTH,))][::5]
-    if not rows:
+def _truth(reader: Reader, flight: RecordedFlight) -> dict[str, Array]:
+    """The plant's truth as far as it belongs to this flight; none, and a remark, when it does not."""
+    items = list(itertools.islice(reader.messages((TRUTH,)), 0, None, 5))
+    flight.remarks += reader.remarks
+    t = np.array([(item.unix_ns - flight.began_ns) * 1e-9 for item in items])
+    if not len(t) or t[-1] < 0.0 or t[0] > flight.seconds:
+        flight.remarks.append(f"{reader.path.name} has no truth of this flight")
         return {}
-    return {
-        name: np.array([row[name] for row in rows], dtype=float) - (start if name == "t" else 0.0) for name in rows[0]
-    }
+    rows = [orjson.loads(item.data) for item in items]
+    return {name: np.array([row[name] for row in rows], dtype=float) for name in rows[0] if name != "t"} | {"t": t}

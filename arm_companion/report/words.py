@@ -11,6 +11,7 @@ from arm_companion.report.flight import RecordedFlight
 
 _HOT_DEGC: Final = 65.0
 _NEAR: Final = 0.9
+_LOST: Final = "load lost"
 _AT_REST: Final = frozenset({"STARTUP", "STOWED", "READY"})
 _TOUCHING: Final = frozenset(
     {"CONTACT", "WRAP", "CLOSE", "VERIFY", "PERCHED", "LIFT", "CARRY", "PLACE", "UNLOAD", "RELEASE"}
@@ -54,9 +55,8 @@ def _headline(flight: RecordedFlight) -> str:
         held = [span.end - span.begin for span in flight.spans if span.name == name]
         if held:
             after = [span.name for span in flight.spans[_last(flight, name) + 1 :]]
-            let_go = "and let go" if "DEPART" in after else "and did not let go in this record"
             times = "once" if len(held) == 1 else f"{len(held)} times"
-            return f"{did} {times}, {sum(held):.0f} s in all, {let_go}."
+            return f"{did} {times}, {sum(held):.0f} s in all, {_end(name, flight, after)}."
     tried = [span for span in flight.spans if span.name == "APPROACH"]
     if not tried:
         return "No perch or grasp was ordered."
@@ -65,27 +65,34 @@ def _headline(flight: RecordedFlight) -> str:
     return f"Did not {did}: {last.cause}." if last else f"Did not {did}."
 
 
+def _end(name: str, flight: RecordedFlight, after: list[str]) -> str:
+    if name == "CARRY" and any(span.cause.startswith(_LOST) for span in flight.spans):
+        return "and lost it"
+    # where the vehicle is not ours the arm opens and is stowed
+    return "and let go" if {"DEPART", "STOWING"} & set(after) else "and did not let go in this record"
+
+
 def _last(flight: RecordedFlight, name: str) -> int:
     return max(i for i, span in enumerate(flight.spans) if span.name == name)
 
 
 def _limits(flight: RecordedFlight) -> list[str]:
     found = []
-    hottest = _most(flight.temperature)
-    if hottest > _HOT_DEGC:
-        found.append(f"a servo reached {hottest:.0f} °C")
+    most = flight.most
+    if most.temperature > _HOT_DEGC:
+        found.append(f"a servo reached {most.temperature:.0f} °C")
     if flight.config is not None:
         wanted = flight.config.rates.cycle_hz
         rate = (flight.cycles + flight.missing) / max(flight.seconds, 1e-9)
         if flight.seconds > 1.0 and rate < _NEAR * wanted:
             found.append(f"the daemon ran {rate:.0f} cycles a second, {wanted:g} are configured: too slow a machine")
         limit = flight.config.limits
-        most = _most(flight.tension)
-        if most > _NEAR * limit.tension_max_n:
-            found.append(f"a tendon reached {most:.1f} N; the limit is {limit.tension_max_n:g} N")
-        force = _most(np.linalg.norm(flight.force_b, axis=1))
-        if force > _NEAR * limit.wrench_force_n:
-            found.append(f"the predicted force reached {force:.1f} N; the limit is {limit.wrench_force_n:g} N")
+        if most.tension.value > _NEAR * limit.tension_max_n:
+            found.append(f"a tendon reached {most.tension.text(1, 'N')}; the limit is {limit.tension_max_n:g} N")
+        if most.force.value > _NEAR * limit.wrench_force_n:
+            found.append(
+                f"the predicted force reached {most.force.text(1, 'N')}; the limit is {limit.wrench_force_n:g} N"
+            )
     return found
 
 
@@ -93,11 +100,13 @@ def _figures(flight: RecordedFlight) -> list[str]:
     """Numbers that every flight has."""
     flying = _where(flight, {span.name for span in flight.spans} - _AT_REST)
     error = np.linalg.norm(flight.setpoint_w - flight.position_w, axis=1)[flying]
-    figures = [
-        f"greatest tendon tension {_most(flight.tension):.1f} N",
-        f"hottest servo {_most(flight.temperature):.0f} °C, lowest voltage {-_most(-flight.voltage):.1f} V",
-        f"greatest predicted force on the airframe {_most(np.linalg.norm(flight.force_b, axis=1)):.1f} N",
-        f"greatest predicted torque {_most(np.linalg.norm(flight.torque_b, axis=1)):.2f} N m",
+    most = flight.most
+    figures = [f"greatest tendon tension {most.tension.text(1, 'N')}, by load alone"]
+    if math.isfinite(most.temperature):
+        figures.append(f"hottest servo {most.temperature:.0f} °C, lowest voltage {most.voltage:.1f} V")
+    figures += [
+        f"greatest predicted force on the airframe {most.force.text(1, 'N')}",
+        f"greatest predicted torque {most.torque.text(2, 'N m')}",
     ]
     if np.isfinite(error).any():
         figures.append(f"vehicle off its set-point by {1e3 * float(np.nanmedian(error)):.0f} mm (median)")
@@ -113,7 +122,9 @@ def _figures(flight: RecordedFlight) -> list[str]:
 
 def force_error(flight: RecordedFlight) -> Array:
     """Distance of predicted and true force at each `t` (k,), N; nan where one is not known."""
-    true = np.column_stack([np.interp(flight.t, flight.truth["t"], flight.truth["force_b"][:, i]) for i in range(3)])
+    t, force = flight.truth["t"], flight.truth["force_b"]
+    unknown = {"left": math.nan, "right": math.nan}
+    true = np.column_stack([np.interp(flight.t, t, force[:, i], **unknown) for i in range(3)])
     error: Array = np.linalg.norm(flight.force_b - true, axis=1)
     return error
 
@@ -124,8 +135,3 @@ def _where(flight: RecordedFlight, names: set[str]) -> Array:
         if span.name in names:
             inside |= (flight.t >= span.begin) & (flight.t < span.end)
     return inside
-
-
-def _most(values: Array) -> float:
-    finite = values[np.isfinite(values)]
-    return float(finite.max()) if finite.size else math.nan

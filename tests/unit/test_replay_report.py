@@ -4,11 +4,12 @@ import dataclasses
 import itertools
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import orjson
 import pytest
 
@@ -18,6 +19,7 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.mission import mission
+from arm_companion.mission.facts import ArmFault
 from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record import replay as replay_module
@@ -34,12 +36,12 @@ from arm_companion.record.topics import (
     LOG,
     STARTS,
     STATE,
-    TRANSITIONS,
     TRUTH,
-    transition,
 )
 from arm_companion.record.versions import versions
 from arm_companion.record_codec import plain
+from arm_companion.report.flight import Span, read
+from arm_companion.report.words import judge
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "perch.mcap"
 
@@ -283,10 +285,6 @@ def test_the_report_is_one_page_that_needs_nothing_else(tmp_path: Path, capsys: 
     start = 0
     for item in reader:
         if item.topic == COMMANDS:
-            for notice in orjson.loads(item.data)["notices"]:
-                if (change := transition(notice["text"])) is not None:
-                    table = {"t": item.unix_ns * 1e-9, "after": change[1], "cause": change[2]}
-                    file.json(TRANSITIONS, item.unix_ns, table)
             start = start or item.unix_ns
         file.raw(item.topic, item.unix_ns, item.data, item.sequence)
     warning = "tendon 3 <b>slack</b> & warm"
@@ -295,7 +293,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(tmp_path: Path, capsys: 
     truth = McapFile(truth_beside(path), {"format": FORMAT, "content": "truth"})
     for i in range(1000):
         values = {"position_w": [0.0] * 3, "force_b": [0.0] * 3, "torque_b": [0.0] * 3, "tension": [4.0] * 4}
-        truth.json(TRUTH, 0, {"t": 0.1 * i, **values, "contact_force_n": 0.0, "wrap_angle": 0.0})
+        truth.json(TRUTH, start + i * 10**8, {"t": 0.1 * i, **values, "contact_force_n": 0.0, "wrap_angle": 0.0})
     truth.close()
 
     assert main(["report", str(path)]) == 0
@@ -320,5 +318,120 @@ def test_a_record_that_was_cut_off_still_makes_a_page(tmp_path: Path, capsys: py
     path.write_bytes(GOLDEN.read_bytes()[:400_000])
     assert main(["report", str(path), "--json", "--output", str(tmp_path / "page")]) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found["grade"] == "look"
+    assert found["grade"] == "bad"
+    assert "the record ends in state PERCHED" in found["points"]
     assert any("cut off" in point for point in found["points"])
+
+
+def altered(target: Path, change: Callable[[int, dict[str, Any], dict[str, Any]], None], cycles: int) -> None:
+    """The golden flight's beginning, at 100 Hz and changed."""
+    reader = Reader(GOLDEN)
+    file = McapFile(target, reader.versions)
+    facts: dict[str, Any] = {}
+    for item in reader:
+        if item.sequence >= cycles:
+            break
+        if item.topic == FACTS:
+            facts = orjson.loads(item.data)
+        elif item.topic == COMMANDS:
+            commands = orjson.loads(item.data)
+            change(item.sequence, facts, commands)
+            for topic, table in ((FACTS, facts), (COMMANDS, commands)):
+                file.json(topic, 10**18 + item.sequence * 10**7, table | {"t": 0.01 * item.sequence}, item.sequence)
+        elif item.topic == CONFIGURATION:
+            file.raw(item.topic, 10**18, item.data)
+    file.close()
+
+
+def test_the_greatest_values_are_those_of_every_cycle(tmp_path: Path) -> None:
+    def one_cycle(number: int, facts: dict[str, Any], commands: dict[str, Any]) -> None:
+        commands["status"]["state"] = "PERCHED"
+        if number == 13:
+            facts["tendons"][1] |= {"tension": 44.0, "tension_sigma": 2.0, "temperature": 71.0, "voltage": 9.5}
+            commands["wrench"] |= {"valid": True, "force_b": [3.0, 0.0, 4.0], "force_sigma": [0.5, "inf", 0.5]}
+            commands["wrench"] |= {"torque_b": [0.0, 0.0, 0.7], "torque_sigma": [0.1] * 3}
+            commands["status"]["error_bits"] = int(ArmFault.TENDON_OVER_TENSION)
+
+    path = tmp_path / "r.mcap"
+    altered(path, one_cycle, 40)
+    flight = read(Reader(path))
+    assert len(flight.t) < 10, "the cycle is not among those that are drawn"
+    text = "; ".join(judge(flight).points)
+    for words in (
+        "a tendon reached 44.0 ± 2.0 N",
+        "greatest predicted force on the airframe 5.0 N",
+        "torque 0.70 ± 0.10 N m",
+        "71 °C, lowest voltage 9.5 V",
+        "tendon over tension",
+    ):
+        assert words in text
+
+
+def test_where_nothing_was_heard_nothing_is_claimed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def deaf(_: int, facts: dict[str, Any], commands: dict[str, Any]) -> None:
+        facts["tendons"] = [tendon | {"age_s": "inf"} for tendon in facts["tendons"]]
+        facts["vehicle"]["position_age_s"] = "inf"
+        commands["wrench"]["valid"] = False
+
+    path = tmp_path / "r.mcap"
+    altered(path, deaf, 40)
+    assert main(["report", str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "tension not known," in said
+    assert "nan" not in said
+    flight = read(Reader(path))
+    assert not np.isfinite(flight.position_w).any()
+    assert not np.isfinite(flight.tension).any()
+
+
+def test_states_are_right_behind_a_gap(tmp_path: Path) -> None:
+    whole = {span.name: span for span in read(Reader(GOLDEN)).spans}
+    end = whole["PERCHED"].end
+    reader = Reader(GOLDEN)
+    times = [c.t for c in replay_module.cycles(reader) if isinstance(c, replay_module.Cycle)]
+    last = next(i for i, t in enumerate(times) if t - times[0] >= end)
+    path = tmp_path / "r.mcap"
+    copy(path, skip=range(last - 5, last + 5))
+    flight = read(Reader(path))
+    (span,) = (span for span in flight.spans if span.name == "PERCHED")
+    assert abs(span.end - end) < 1.0
+    after = flight.spans[flight.spans.index(span) + 1]
+    assert (after.name, after.cause) == ("UNLOAD", "not in the record")
+    assert judge(flight).headline == "Perched once, 38 s in all, and let go."
+    copy(path, skip=range(7))
+    assert any("7 of" in point and "missing" in point for point in judge(read(Reader(path))).points)
+
+
+@pytest.mark.parametrize(
+    ("states", "headline"),
+    [
+        ("PERCHED HOLDING RELEASE STOWING STOWED", "Perched once, 10 s in all, and let go."),
+        ("PERCHED HOLDING", "Perched once, 10 s in all, and did not let go in this record."),
+        ("CARRY PLACE RELEASE DEPART", "Carried an object once, 10 s in all, and let go."),
+        ("CARRY HOLDING:load_lost RELEASE STOWING", "Carried an object once, 10 s in all, and lost it."),
+    ],
+)
+def test_how_it_ended(states: str, headline: str) -> None:
+    spans = []
+    for i, word in enumerate(states.split()):
+        name, _, cause = word.partition(":")
+        spans.append(Span(name, 10.0 * i, 10.0 * (i + 1), cause.replace("_", " ") + ": it is so"))
+    assert judge(dataclasses.replace(read(Reader(GOLDEN)), spans=spans)).headline == headline
+
+
+def test_a_truth_that_does_not_belong_is_left_out(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, other = tmp_path / "r.mcap", tmp_path / "other.mcap"
+    copy(path, upto=30)
+    truth_beside(path).write_bytes(b"")
+    assert main(["report", str(path)]) == 0
+    assert "r.truth.mcap: cut off" in capsys.readouterr().out
+    file = McapFile(other, {"format": FORMAT, "content": "truth"})
+    for i in range(1000):
+        values = {"position_w": [0.0] * 3, "force_b": [0.0] * 3, "torque_b": [0.0] * 3, "tension": [4.0] * 4}
+        file.json(TRUTH, 10**18 + i * 10**8, {"t": 0.1 * i, **values, "contact_force_n": 0.0, "wrap_angle": 0.0})
+    file.close()
+    for wrong in (other, GOLDEN):
+        assert main(["report", str(path), "--truth", str(wrong)]) == 0
+        said = capsys.readouterr().out
+        assert f"{wrong.name} has no truth of this flight" in said
+        assert "against the simulator's truth" not in said
