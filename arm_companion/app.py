@@ -246,9 +246,10 @@ class Daemon:
         now = self._clock.now()
         before = self._state
         self._state, commands = step(before, facts, now, self._parameters)
-        await self._act(commands, facts, now)
-        record = Record(now, facts, before, commands)
-        self._recorder.put(record)
+        try:
+            await self._act(commands, facts, now)
+        finally:  # memory has moved on: without this cycle the record would not lead to the next
+            self._recorder.put(record := Record(now, facts, before, commands))
         self._onlookers.publish(record, Situation(self._state, facts, now, self._parameters), self._health)
         for text in self._recorder.troubles():
             log.warning("%s", text)

@@ -119,6 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.output.mkdir(parents=True, exist_ok=True)
     if arguments.sitl_connect:
         return sitl.check_running(arguments)
+    _truth_path(arguments).unlink(missing_ok=True)  # the report must not take an earlier run's for this one's
     return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
 
 
@@ -256,16 +257,21 @@ def _trials(arguments: argparse.Namespace, config: Config) -> int:
 def _write_truth(arguments: argparse.Namespace, flight: Any) -> None:
     """Beside the record, where `report` looks for it."""
     from arm_companion.clock import SIMULATED_EPOCH_S, unix_now  # noqa: PLC0415
-    from arm_companion.record.reader import truth_beside  # noqa: PLC0415
     from arm_companion.sim.truth import write_truth  # noqa: PLC0415
 
     offset = SIMULATED_EPOCH_S if arguments.simulated else unix_now() - time.perf_counter()
-    write_truth(truth_beside(_record_path(arguments)), flight.samples, lambda t: t + offset)
+    write_truth(_truth_path(arguments), flight.samples, lambda t: t + offset)
 
 
 def _record_path(arguments: argparse.Namespace) -> Path:
     path: Path = arguments.log or arguments.output / "record.mcap"
     return path
+
+
+def _truth_path(arguments: argparse.Namespace) -> Path:
+    from arm_companion.record.reader import truth_beside  # noqa: PLC0415
+
+    return truth_beside(_record_path(arguments))
 
 
 def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:

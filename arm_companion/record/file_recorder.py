@@ -8,6 +8,7 @@ and neither ever costs a cycle.
 
 import collections
 import logging
+import secrets
 import sys
 import threading
 from collections.abc import Callable
@@ -330,7 +331,8 @@ class FileRecorder(Recorder):
         path = storage.part(self._first, self._parts + 1)
         self._make_room(path)
         goes_on = bool(self._begun)
-        self._begun = self._begun or str(self._ns(t))  # ties the parts together
+        # ties the parts together, and to no others of this name: every simulated flight begins at the same time
+        self._begun = self._begun or f"{self._ns(t)}-{secrets.token_hex(4)}"
         self._file = self._open_file(path, {**self._versions, "part": str(self._parts + 1), "begun": self._begun})
         self._parts += 1
         self._synced = t

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import itertools
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -11,12 +12,14 @@ from arm_companion import app
 from arm_companion.app import Daemon, Openers
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config import load
+from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import Phase
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 from arm_companion.record.recorder import MemoryRecorder
+from arm_companion.record_codec import dumps
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
 from arm_companion.supervisor import ServiceManager
 from arm_companion.transport.memory import MemoryPipe
@@ -160,6 +163,28 @@ def test_a_fault_is_in_the_facts_of_the_very_cycle_in_which_the_bus_tells_it(gro
         after = [record.facts.tendons[2].error_bits for record in field.recorder.records[before:]]
         assert after == [HardwareError.OVERHEATING] * len(after)
         assert len(after) >= 4
+
+    play(ground_peer, story)
+
+
+def test_a_cycle_that_fails_as_it_acts_is_recorded(ground_peer: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise RuntimeError("a bug")
+
+    async def story(field: Field) -> None:
+        config, records = field.config, field.recorder.records
+        begin = len(records) - 3
+        with monkeypatch.context() as broken:
+            broken.setattr(field.daemon._telemetry, "publish", fail)
+            await asyncio.sleep(0.05)
+        await asyncio.sleep(0.05)
+        assert field.daemon.failures > 2
+        field.daemon.failures = 0  # they were meant
+        parameters = Parameters(config, field.daemon._parameters.model)
+        for record, following in itertools.pairwise(records[begin:]):
+            state, commands = app.step(record.state, record.facts, record.t, parameters)
+            assert commands == record.commands
+            assert dumps(state) == dumps(following.state)
 
     play(ground_peer, story)
 

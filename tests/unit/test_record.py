@@ -448,6 +448,18 @@ def test_a_part_that_was_only_begun_hides_nothing(tmp_path: Path, cut: int) -> N
     assert "r-002.mcap: cut off before its first cycle" in remarks[0]
 
 
+def test_a_shorter_record_of_the_same_name_and_time_has_no_parts_of_the_longer_one(tmp_path: Path) -> None:
+    write(tmp_path / "r.mcap")
+    made = recorder(tmp_path / "r.mcap", part_mb=1.0, raw_kb_per_s=10_000.0)
+    for record in records():
+        made.frame(Frame(record.t, "servos", False, os.urandom(8000)))
+        made.put(record)
+    made.close()
+    assert (tmp_path / "r-002.mcap").exists()
+    write(tmp_path / "r.mcap")
+    assert facts(tmp_path / "r.mcap") == (len(records()), [])
+
+
 def test_a_start_at_the_same_second_leaves_the_earlier_record(tmp_path: Path) -> None:
     config = load("sim.toml", [f'record.directory="{tmp_path}"'])
     (tmp_path / "20231114-221321-002.mcap").write_bytes(b"a part of another")

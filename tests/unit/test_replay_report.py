@@ -16,6 +16,7 @@ import pytest
 from arm_companion.__main__ import main
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
+from arm_companion.cli import sim
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.mission import mission
@@ -435,3 +436,10 @@ def test_a_truth_that_does_not_belong_is_left_out(tmp_path: Path, capsys: pytest
         said = capsys.readouterr().out
         assert f"{wrong.name} has no truth of this flight" in said
         assert "against the simulator's truth" not in said
+
+
+def test_an_earlier_runs_truth_is_gone_before_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sim, "_fly", lambda *_: 0)
+    (tmp_path / "record.truth.mcap").write_bytes(b"of an earlier run")
+    assert main(["sim", "perch", "--simulated", "--output", str(tmp_path)]) == 0
+    assert not (tmp_path / "record.truth.mcap").exists()
