@@ -45,8 +45,9 @@ class Onlookers:
 
     def configure(self, config: Config) -> None:
         """This configuration is in force from now on."""
-        if self._live is not None:
-            self._live.configure(config)
+        for part in (self._page, self._live):
+            if part is not None:
+                part.configure(config)
 
     def publish(self, record: Record, cycle: Situation, health: Callable[[], Health]) -> None:
         """Tell of a cycle; called in every one, and never raises.

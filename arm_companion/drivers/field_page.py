@@ -54,8 +54,8 @@ class FieldPage:
         page = config.page
         check_token(page.token_file)
         self._clock = clock
-        settings = {"page": asdict(page), "setup": _setup(config)}
-        self._process = SideProcess("page", _MODULE, settings, _QUEUE, self._hear)
+        self._settings = {"page": asdict(page), "setup": _setup(config)}
+        self._process = SideProcess("page", _MODULE, self._settings, _QUEUE, self._hear)
         self._commands = (
             RemoteCommands("page", page.command_system, commands, clock, self._put, age_s=_ABORT_AGE_S)
             if page.abort
@@ -74,6 +74,11 @@ class FieldPage:
     def event(self, notice: Notice) -> None:
         """Tell a sentence for people."""
         self._process.safely(lambda: self._put(payloads.event(self._unix(), notice)))
+
+    def configure(self, config: Config) -> None:
+        """This configuration is in force from now on."""
+        self._settings["setup"] = _setup(config)  # for a process that is started later
+        self._process.safely(lambda: self._process.put("limits", json.dumps(_limits(config)).encode()))
 
     def publish(self, now: float, cycle: Situation, commands: Commands, health: Callable[[], Health]) -> None:
         """Queue what is due; called once a cycle, and never raises.
@@ -149,12 +154,19 @@ def _setup(config: Config) -> dict[str, Any]:
     """What the page has to know once."""
     return {
         "abort": config.page.abort,
+        **_limits(config),
+        "mount": list(config.mount.position_m),
+        "disk_radius": config.perch.disk_radius_m,
+    }
+
+
+def _limits(config: Config) -> dict[str, float]:
+    """What the ground may change while the page is open."""
+    return {
         "tension_max": config.limits.tension_max_n,
         "tension_min": config.limits.tension_min_n,
         "force_max": config.limits.wrench_force_n,
         "torque_max": config.limits.wrench_moment_nm,
-        "mount": list(config.mount.position_m),
-        "disk_radius": config.perch.disk_radius_m,
     }
 
 

@@ -7,6 +7,8 @@ from typing import Final
 
 _ONE_BY_ONE: Final = frozenset({"events", "answer"})
 """Topics of which every message counts."""
+_LASTING: Final = frozenset({"setup", "limits"})
+"""Topics that hold until they are told again. What the arm does is old a moment later, and nobody is told it as new."""
 _KEPT: Final = 50
 
 
@@ -50,7 +52,7 @@ class Audience:
     def __init__(self, counted: Callable[[int], None]) -> None:
         self._counted = counted
         self._viewers: set[Viewer] = set()
-        self._newest: dict[str, str] = {}
+        self._lasting: dict[str, str] = {}
         self._said: deque[str] = deque(maxlen=_KEPT)
 
     def __len__(self) -> int:
@@ -60,15 +62,15 @@ class Audience:
         """A message of the daemon's, for everybody and for who comes later."""
         if topic == "events":
             self._said.append(payload)
-        elif topic not in _ONE_BY_ONE:
-            self._newest[topic] = payload
+        elif topic in _LASTING:
+            self._lasting[topic] = payload
         for viewer in self._viewers:
             viewer.put(topic, payload)
 
     def join(self) -> Viewer:
         """Somebody begins to look: he is told what holds and what was said lately."""
         viewer = Viewer()
-        for topic, payload in self._newest.items():
+        for topic, payload in self._lasting.items():
             viewer.put(topic, payload)
         for payload in self._said:
             viewer.put("events", payload)

@@ -241,9 +241,12 @@ async def event(reader: asyncio.StreamReader, topic: str) -> dict[str, Any]:
 
 def test_a_viewer_hears_all_from_now_on_and_what_holds() -> None:
     async def test(at: Desk) -> None:
-        at.server.audience.put("state", '{"state": "READY"}')
+        at.server.audience.put("state", '{"state": "STOWED"}')
+        at.server.audience.put("setup", "{}")
         reader, writer = await at.call()
         writer.write(f"GET /events HTTP/1.1\r\nHost: {at.host}\r\n\r\n".encode())
+        assert await event(reader, "setup") == {}
+        at.server.audience.put("state", '{"state": "READY"}')
         assert (await event(reader, "state"))["state"] == "READY"
         at.server.audience.put("answer", '{"nonce": "n"}')
         assert (await event(reader, "answer"))["nonce"] == "n"
@@ -409,18 +412,21 @@ def test_a_browser_gives_the_token_sees_the_arm_and_aborts(tmp_path: Path) -> No
 def test_the_page_draws_what_it_is_told_and_shows_texts_as_texts(tmp_path: Path) -> None:
     async def test(at: Desk) -> None:
         put = at.server.audience.put
-        put("setup", json.dumps({"abort": True, "tension_max": 45, "force_max": 12, "torque_max": 2.5,
+        put("setup", json.dumps({"abort": True, "tension_max": 45, "force_max": 12, "torque_max": 25,
                                  "mount": [0, 0, 0.1], "disk_radius": 0.02}))  # fmt: skip
         line = [[0.0, 0.0, 0.1 + 0.01 * i] for i in range(12)]
         bar = {"point": [0.2, 0.0, 0.2], "axis": [0.0, 1.0, 0.0], "radius": 0.035}
-        put("wrench", json.dumps({"valid": True, "source": "anchored", "force": [6.0, 0.0, 3.0],
+        wrench = (json.dumps({"valid": True, "source": "anchored", "force": [6.0, 0.0, 3.0],
                                   "torque": [0.0, 3.0, None], "force_sigma": [0.1, 0.1, 0.1],
                                   "torque_sigma": [0.1, 0.1, None]}))  # fmt: skip
-        put("arm", json.dumps({"backbone": line, "held": True, "bar": bar}))
         hostile = "<img src=x onerror=document.title='broken'><script>document.title='broken'</script>"
         put("events", json.dumps({"severity": "error", "text": hostile, "time": 1.0}))
         async with chromium(tmp_path) as tab:
             await tab.open(f"http://{at.host}/")
+            await tab.until("document.querySelector('#events li') !== null")
+            put("limits", json.dumps({"torque_max": 2.5}))
+            put("wrench", wrench)
+            put("arm", json.dumps({"backbone": line, "held": True, "bar": bar}))
             await tab.until("document.querySelectorAll('#side .spine').length === 2")
             assert await tab.ask("document.querySelectorAll('#side .bar').length") == 1, "seen along its axis"
             assert await tab.ask("document.querySelectorAll('#rear .barline').length") == 1, "seen across"

@@ -123,7 +123,11 @@ def test_a_slow_viewer_gets_the_newest_of_each_and_every_sentence() -> None:
         audience.leave(viewer)
         audience.leave(viewer)
         assert counts == [1, 0, 0]
-        assert ("answer", "999") not in await audience.join().take(1.0), "an answer is for who asked"
+        audience.put("setup", "what lasts")
+        found = await audience.join().take(1.0)
+        assert ("answer", "999") not in found, "an answer is for who asked"
+        assert ("setup", "what lasts") in found
+        assert {topic for topic, _ in found} == {"setup", "events"}, "no state of who knows when, as if it were new"
 
     run_simulated(main())
 
@@ -173,6 +177,18 @@ def test_it_is_told_five_times_a_second_while_somebody_looks_and_sentences_alway
         assert [topics.count(name) for name in ("state", "wrench", "tendons", "arm", "health")] == [10, 10, 10, 10, 2]
         page._hear("gone", "")
         assert await fly(1) == []
+
+    with_page(test)
+
+
+def test_limits_that_the_ground_changes_are_those_that_are_shown() -> None:
+    async def test(page: FieldPage, _component: Component, _clock: Clock) -> None:
+        limits = dataclasses.replace(CONFIG.limits, tension_max_n=30.0, wrench_force_n=7.0)
+        page.configure(dataclasses.replace(CONFIG, limits=limits))
+        ((topic, now),) = told(page)
+        assert topic == "limits"
+        for shown in (now, page._settings["setup"]):
+            assert (shown["tension_max"], shown["force_max"]) == (30.0, 7.0)
 
     with_page(test)
 

@@ -68,6 +68,10 @@ const show = {
     $("events").replaceChildren(); // what was said lately follows
   },
 
+  limits(data) {
+    Object.assign(setup, data);
+  },
+
   state(data) {
     $("state").textContent = data.state;
     $("behaviour").textContent = data.progress === null ? data.behaviour : `${data.behaviour} · ${data.progress} %`;
