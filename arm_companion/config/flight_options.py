@@ -131,7 +131,13 @@ class RecordConfig:
 
     directory: str = option("where records go, one file a start; empty: none unless `file` is set", "")
     file: str = option("this very file instead, overwritten at each start", "")
-    part_mb: float = option("a record goes on in another file beyond this size", 200.0, unit="MB", lower=1.0, upper=1e5)
+    part_mb: float = option(
+        "a record goes on in another file beyond this size, or a quarter of the budget",
+        200.0,
+        unit="MB",
+        lower=1.0,
+        upper=1e5,
+    )
     budget_mb: float = option(
         "most that all records of the directory take, the oldest are deleted; 0: any",
         4000.0,

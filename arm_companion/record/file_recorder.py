@@ -115,6 +115,8 @@ class FileRecorder(Recorder):
         """Cycles that the disk has cost."""
         self._first = path
         self._options = options
+        # several fit into the budget, so that making room for the next leaves something of the flight
+        self._part_mb = min(options.part_mb, 0.25 * options.budget_mb) if options.budget_mb else options.part_mb
         self._versions = dict(versions)
         self._unix = unix
         self._patient = patient
@@ -293,7 +295,7 @@ class FileRecorder(Recorder):
         if file is None:
             return
         self._write(file, batch)
-        if file.size > self._options.part_mb * _MB:
+        if file.size > self._part_mb * _MB:
             self._finish()
             self._next_part(t)
         elif t - self._synced > _SYNC_S:
@@ -344,7 +346,7 @@ class FileRecorder(Recorder):
 
     def _make_room(self, present: Path) -> None:
         options = self._options
-        for file in storage.make_room(self._first, present, options.budget_mb, options.keep_free_mb):
+        for file in storage.make_room(self._first, present, self._part_mb, options.budget_mb, options.keep_free_mb):
             log.info("record: %s deleted, the disk budget is used up", file)
         if storage.free_mb(self._first.parent) < options.keep_free_mb:
             self._finish()

@@ -24,7 +24,7 @@ def following(path: Path) -> Path:
     return path.with_name(f"{match[1]}-{int(match[2]) + 1:03d}{path.suffix}")
 
 
-def make_room(first: Path, present: Path, budget_mb: float, keep_free_mb: float) -> list[Path]:
+def make_room(first: Path, present: Path, part_mb: float, budget_mb: float, keep_free_mb: float) -> list[Path]:
     """Delete the oldest records until budget and free space are kept; the present part stays.
 
     Only files are looked at whose names this program gives: the parts of this record, and in a directory of
@@ -33,6 +33,7 @@ def make_room(first: Path, present: Path, budget_mb: float, keep_free_mb: float)
     Args:
         first: the first part of the record.
         present: the part that is being written.
+        part_mb: what it will take in the end, MB.
         budget_mb: most that all of them may take, MB; 0: any.
         keep_free_mb: least to leave free on the disk, MB.
 
@@ -42,15 +43,14 @@ def make_room(first: Path, present: Path, budget_mb: float, keep_free_mb: float)
     Raises:
         OSError: the directory cannot be read, or a file not deleted.
     """
-    files = sorted(_candidates(first), key=lambda file: (file.stat().st_mtime_ns, file.name))
-    total = sum(file.stat().st_size for file in files)
+    others = (file for file in _candidates(first) if file != present)
+    files = sorted(others, key=lambda file: (file.stat().st_mtime_ns, file.name))
+    total = part_mb * _MB + sum(file.stat().st_size for file in files)
     gone = []
     for file in files:
         over = budget_mb and total > budget_mb * _MB
         if not over and shutil.disk_usage(first.parent).free > keep_free_mb * _MB:
             break
-        if file == present:
-            continue
         total -= file.stat().st_size
         file.unlink()
         gone.append(file)
