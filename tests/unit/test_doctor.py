@@ -291,12 +291,14 @@ def test_the_parameters_that_the_service_has_kept_are_in_force(
 
 
 @pytest.fixture
-def open_place(quiet_machine: Path) -> Iterator[Path]:
-    """A directory into which other users see, as they do not into pytest's own."""
+def open_place(quiet_machine: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """The same machine below a directory into which other users see, as they do not into pytest's own."""
     assert quiet_machine.is_dir()
-    with tempfile.TemporaryDirectory() as place:
-        Path(place).chmod(0o755)
-        yield Path(place)
+    with tempfile.TemporaryDirectory() as name:
+        place = Path(name)
+        place.chmod(0o755)
+        monkeypatch.setattr(command, "machine", lambda: machine(place))
+        yield place
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root may read and write everything")
