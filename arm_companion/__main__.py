@@ -10,6 +10,7 @@ from arm_companion import __version__
 from arm_companion.errors import ArmError, ConfigError
 
 _INTERRUPTED = 130  # 128 + SIGINT, as shells count
+_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS")  # our matrices are small: threads wait more than they work
 _COMMANDS = {
     "run": "the daemon: fly the arm",
     "ground": "hear and command the arm from the ground",
@@ -47,6 +48,8 @@ def command_line(named: Collection[str] = tuple(_COMMANDS)) -> argparse.Argument
 
 def main(argv: list[str] | None = None) -> int:
     """Parse the command line and run one command; returns the exit code."""
+    for name in _ONE_THREAD:  # before a command imports NumPy
+        os.environ.setdefault(name, "1")
     words = sys.argv[1:] if argv is None else argv
     named = next((word for word in words if not word.startswith("-")), "")
     arguments = command_line([named]).parse_args(words)

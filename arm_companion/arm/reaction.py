@@ -236,13 +236,12 @@ def _sigma(solution: ArmSolution, T_ba: Pose, at_base: Array, spread: Spread) ->
     d = solution.derivatives
     X = wrench.transform_matrix(T_ba)
     g = solution.gravity
-    weight = np.concatenate((solution.moments.mass * g, so3.cross(solution.moments.first, g)))
     columns = (
         (spread.EI * d.parameters["EI"])[:, None],
         (spread.GJ * d.parameters["GJ"])[:, None],
         (spread.k_T * d.parameters["k_T"])[:, None],
         (spread.T0 * d.parameters["T0"])[:, None],
-        (spread.mass * weight)[:, None],
+        (spread.mass * (d.gravity @ g))[:, None],  # a heavier arm is the same arm in a stronger field
         spread.pull * d.pull,
         spread.hold_position * d.hold[:, :3],
         spread.hold_rotation * d.hold[:, 3:],

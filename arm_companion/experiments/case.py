@@ -151,13 +151,10 @@ def stiffness(compliance: Array) -> Array:
     """Force per tip displacement (3, 3), N/m, base axes, tip free to turn: the inverse where there is one.
 
     An inextensible arm cannot give along a straight backbone. Such directions are left out (zero), as in a
-    pseudo-inverse: their stiffness is not finite.
+    pseudo-inverse: their stiffness is not finite. Negative where only the hold keeps the arm from buckling, and
+    unsymmetric under loads that have no potential, such as those that turn with the tip.
     """
-    C = 0.5 * (compliance[:3, :3] + compliance[:3, :3].T)
-    give, axes = np.linalg.eigh(C)
-    kept = give > 1e-9 * give.max()
-    inverse = np.divide(1.0, give, out=np.zeros(3), where=kept)
-    return sealed(axes @ (inverse[:, None] * axes.T))
+    return sealed(np.linalg.pinv(compliance[:3, :3], rcond=1e-9))
 
 
 def k_psi(solution: ArmSolution, parameters: ArmParameters, delta: float = 0.0) -> Array:

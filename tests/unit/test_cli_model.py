@@ -3,6 +3,9 @@
 import importlib.util
 import json
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -266,6 +269,31 @@ def test_stiffness(ask: Asker, row: dict[str, Any]) -> None:
 def test_stiffness_inverts_the_compliance_of_a_bent_arm(ask: Asker) -> None:
     answer = ask.json("stiffness", "--theta-deg", 30)
     assert np.allclose(answer["stiffness_n_per_m"] @ answer["compliance"][:3, :3], np.eye(3), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("clamp", "--base-move-mm", 0, 0, 12),  # only the clamp keeps it from buckling
+        ("deflect", "--follower", "--force", 1, 0.5, 0.3),  # no potential: unsymmetric
+    ],
+)
+def test_stiffness_inverts_the_compliance_of_a_loaded_arm(ask: Asker, words: tuple[object, ...]) -> None:
+    answer = ask.json(*words, "--theta-deg", 30)
+    unit = answer["stiffness_n_per_m"] @ answer["compliance"][:3, :3]
+    assert np.allclose(unit, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="counts threads by /proc")
+def test_small_matrices_take_no_threads() -> None:
+    program = (
+        "import os\nfrom arm_companion.__main__ import main\nmain(['model', 'pose', '--json'])\n"
+        "print(len(os.listdir('/proc/self/task')))"
+    )
+    bare = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", program], env=bare, capture_output=True, text=True, check=True)
+    assert done.stdout.split()[-1] == "1"
+
 
 
 @pytest.mark.parametrize("curve", TABLES["perching"], ids=lambda c: f"{c['bc']} {c['dir']} {c['g']:g}")

@@ -1,6 +1,7 @@
 """From base wrench to airframe: frames, inertia counted once, spread, validity; contact and external force."""
 
 import math
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -144,6 +145,26 @@ def test_sigma_is_what_random_parameters_scatter():
     scatter = np.std(samples, axis=0)
     assert np.all(predicted.sigma > 0.75 * scatter)
     assert np.all(predicted.sigma < 1.33 * scatter)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_sigma_of_the_mass_counts_how_the_arm_gives_way_to_it(held):
+    nothing = dict.fromkeys((f.name for f in fields(Spread)), 0.0)
+    spread = Spread(**{**nothing, "mass": 0.03})
+    gravity = np.array((5.0, 0.0, -8.0))
+    pull = MODEL.pull_for_bend((-1.2, 0.0))
+    hold = MODEL.free(pull, gravity).hold(0.25, HoldKind.CLAMPED)
+    hold = hold.seen_from(Pose(np.eye(3), np.array((0.005, 0.0, -0.01))))
+
+    def solved(factor):
+        segments = tuple(replace(s, line_mass=s.line_mass * factor, end_mass=s.end_mass * factor) for s in P.segments)
+        model = RodModel(replace(P, segments=segments))
+        return model.held(pull, hold, gravity) if held else model.free(pull, gravity, payload=Payload(0.15 * factor))
+
+    at_base = Pose(np.eye(3), np.zeros(3))
+    told = reaction(solved(1.0), at_base, gravity, spread=spread).sigma
+    change = np.abs(solved(1.03).base_wrench - solved(0.97).base_wrench) / 2
+    assert np.allclose(told, change, rtol=0.02, atol=1e-5)
 
 
 def test_what_may_not_be_acted_upon_says_why():
