@@ -52,7 +52,8 @@ class FastRod(Rod):
             _own(self.node_stiffness),
             _own(self.node_chord),
         )
-        self._limits = np.array((self.moment_scale, s, TOLERANCE, STEP_LIMIT, float(ITERATIONS), self.arm_mass))
+        tolerance = max(TOLERANCE, self.rounding)
+        self._limits = np.array((self.moment_scale, s, tolerance, STEP_LIMIT, float(ITERATIONS), self.arm_mass))
         self.compiled_newton = self._newton
 
     def evaluate(self, c: Array, loads: Loads, pull: Array, stiffness: Array) -> State:

@@ -38,6 +38,7 @@ _EYE = np.eye(3)
 _SKEW = np.zeros((3, 9))
 _SKEW[[0, 0, 1, 1, 2, 2], [2, 6, 5, 7, 3, 1]] = (1.0, -1.0) * 3
 FAINT = 1e-4  # energy of loads, beside that of a radian's bend, under which `Rod.imbalance` does not tell them apart
+_ROUNDING = 16 * 2.0**-52
 _TINY = 1e-300
 
 
@@ -201,6 +202,8 @@ class Rod:
         self._squares = np.stack((self.cos**2, self.cos * self.sin, self.sin**2))
         self.cable_weights = runs * mesh.weights
         self.straight = self.cable_weights.sum(axis=1)
+        # What rounding of the tendons' paths leaves of the unbalanced moment, in the rod's own.
+        self.rounding = _ROUNDING * self.s * float(self.r.max() * P.k_T.max()) / self.moment_scale
         self._radial_t = np.ascontiguousarray((mesh.basis * self.r).T)
         # Chords between disks: path density l_d^2 / 24 |kappa|^2 less, l_d the distance of the disks.
         disks = P.guides is Guides.DISKS

@@ -18,7 +18,7 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 
 TOLERANCE = 1e-9
-"""Of residual and constraint, relative to the rod's own moment and length."""
+"""Of residual and constraint, relative to the rod's own moment and length; `Rod.rounding` where that is more."""
 
 TOO_SHARP = "a bend sharper than the tendons' pitch radius"
 NO_CONVERGENCE = "no convergence: the arm snaps, or is taut"
@@ -220,7 +220,7 @@ def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array |
     if rod.compiled_newton is not None:
         found: Solved | str = rod.compiled_newton(problem, c, wrench, tangent)
         return found
-    support, L, last = problem.support, rod.s, math.inf
+    support, L, last, tolerance = problem.support, rod.s, math.inf, max(TOLERANCE, rod.rounding)
     K, C, own = tangent, None, False
     for iteration in range(ITERATIONS):
         loads = problem.loads_with(wrench)
@@ -236,7 +236,7 @@ def newton(rod: Rod, problem: Problem, c: Array, wrench: Array, tangent: Array |
             gap, C = support.gap(state)
             error /= rod.moment_scale + _largest(wrench) * L
             error = max(error, _largest(gap[:3]) / L, _largest(gap[3:]))
-        if error < TOLERANCE:
+        if error < tolerance:
             # A neighbour's tangent says nothing about the stability of this equilibrium.
             return Solved(rod, problem, c, wrench, state, iteration, error, K if own else None, C)
         if not error < 1e3 * max(last, 1e-3):

@@ -43,8 +43,8 @@ def tip_compliance(
 def stiffness_along(compliance: Array, direction: ArrayLike) -> float:
     """Force per deflection, N/m, along a direction d (3,), the tip free to give in all others: 1 / (d^T C d).
 
-    Infinite where the model cannot give at all, negative where it gives way against the force. Inverting the whole compliance would need it to be regular,
-    which the arc's (rank 2) never is.
+    Infinite where the model cannot give at all, negative where it gives way against the force. Inverting the whole
+    compliance would need it to be regular, which the arc's (rank 2) never is.
     """
     d = np.asarray(direction, dtype=np.float64)
     d = d / np.sqrt(d @ d)

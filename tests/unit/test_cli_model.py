@@ -295,7 +295,6 @@ def test_small_matrices_take_no_threads() -> None:
     assert done.stdout.split()[-1] == "1"
 
 
-
 @pytest.mark.parametrize("curve", TABLES["perching"], ids=lambda c: f"{c['bc']} {c['dir']} {c['g']:g}")
 def test_perching(ask: Asker, curve: dict[str, Any]) -> None:
     sign = 1 if curve["dir"][1] == "+" else -1

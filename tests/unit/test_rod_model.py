@@ -419,6 +419,22 @@ def test_sections_lie_on_the_backbone():
     assert np.allclose(solution.shape(501), p)
 
 
+@pytest.mark.parametrize("fast", [False, True])
+@pytest.mark.parametrize("guides", Guides)
+def test_tendons_far_stiffer_than_the_backbone_are_solved_as_well_as_rounding_allows(fast, guides):
+    if fast:
+        pytest.importorskip("numba")
+    segment = Segment(L=0.25, r=0.02, disks=10, EI=1e-4, GJ=7.5e-5, line_mass=0.01, end_mass=0.0)
+    tendons = tuple(Tendon(-0.5 * math.pi * k, 1e6, 0.05) for k in range(4))
+    model = RodModel(ArmParameters((segment,), tendons, guides), fast=fast)
+    for theta, delta in itertools.product((0.2, 0.7, 1.1, 1.6), (0.0, 0.4, 2.0)):
+        bend = (theta * math.cos(delta), theta * math.sin(delta))
+        pull = model.pull_for_bend(bend)
+        free = model.free(pull, NOTHING)
+        assert np.allclose(free.bend, model.bend_for_pull(pull), atol=1e-7)
+        assert np.allclose(free.bend, bend, atol=1e-3)  # a tendon that would have to push is slack
+
+
 def test_the_compiled_model_gives_the_same_answers():
     pytest.importorskip("numba")
     fast = RodModel(REFERENCE, fast=True)
