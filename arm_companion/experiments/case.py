@@ -154,7 +154,7 @@ def stiffness(compliance: Array) -> Array:
     pseudo-inverse: their stiffness is not finite. Negative where only the hold keeps the arm from buckling, and
     unsymmetric under loads that have no potential, such as those that turn with the tip.
     """
-    return sealed(np.linalg.pinv(compliance[:3, :3], rcond=1e-9))
+    return sealed(np.asarray(np.linalg.pinv(compliance[:3, :3], rcond=1e-9), dtype=np.float64))
 
 
 def k_psi(solution: ArmSolution, parameters: ArmParameters, delta: float = 0.0) -> Array:
