@@ -70,7 +70,7 @@ class EmulatedServo:
         self._trajectory = Trajectory(position)
         self._turns = 0.0  # ticks from the horn's true position to the reported one
         self._wakes_at: float | None = None
-        self._powered = True
+        self._powered = self._plugged = True
         self._clock = 0.0
         self._booted_at = 0.0
         self._heard_at = 0.0
@@ -140,7 +140,11 @@ class EmulatedServo:
         self._temperature = temperature
 
     def set_power(self, *, on: bool) -> None:
-        """Cut or restore the supply; it boots afresh, and forgets turns and RAM."""
+        """Cut or restore its cable; it boots afresh, and forgets turns and RAM."""
+        self._plugged = on
+        self._power(on=on)
+
+    def _power(self, *, on: bool) -> None:
         if on and not self._powered:
             self._wakes_at = self._clock + BOOT_S
         if not on:
@@ -223,8 +227,8 @@ class EmulatedServo:
         """Let `dt` seconds pass under a load (N m on the horn) and a supply voltage."""
         self._clock += dt
         self._voltage = voltage
-        if (voltage >= BROWN_OUT_V) != self._powered:
-            self.set_power(on=not self._powered)
+        if (self._plugged and voltage >= BROWN_OUT_V) != self._powered:
+            self._power(on=not self._powered)
         if self._wakes_at is not None and self._clock >= self._wakes_at:
             self._wakes_at = None
             self._boot()

@@ -602,3 +602,18 @@ def test_what_is_no_link_is_left_alone(runner: asyncio.Runner, tmp_path: Path) -
     with pytest.raises(LinkError, match="no simulated port"):
         runner.run(EmulatedBus(ServoEmulator(CONFIG), CONFIG).serve_pty(path))
     assert path.read_text() == "mine"
+
+
+def test_one_servo_without_its_cable_stays_without_power_until_it_has_it_again() -> None:
+    master = Master()
+    master.emulator[2].set_power(on=False)
+    master.wait(1.0)
+    assert [servo.awake for servo in master.emulator.servos] == [True, False, True, True]
+    master.emulator.supply_v = 0.0
+    master.wait(0.1)
+    master.emulator.supply_v = 12.0
+    master.wait(1.0)
+    assert not master.emulator[2].awake
+    master.emulator[2].set_power(on=True)
+    master.wait(1.0)
+    assert master.emulator[2].awake

@@ -164,6 +164,7 @@ def test_after_a_loss_of_power_it_closes_again_by_itself() -> None:
         seize(rig.fifth)
         assert (await rig.cycles(1.0, CLOSE)).load > CONFIG.gripper.load_min
         rig.fifth.set_power(on=False)
+        rig.fifth.set_power(on=True)
         jaws = await rig.cycles(2.5, CLOSE)
         assert (jaws.homed, jaws.torque, jaws.ready, jaws.silent) == (True, True, True, False)
         assert jaws.load > CONFIG.gripper.load_min
