@@ -24,7 +24,7 @@ def draw(flight: Flight, config: Config, title: str, path: Path) -> None:
     with mpl.rc_context(style):
         figure = Figure(figsize=(11, 9.5), layout="constrained")
         axes = figure.subplots(5, 1, sharex=True, height_ratios=[1.3, 1.2, 1.0, 1.3, 1.3])
-        start = flight.states[0][0] if flight.states else 0.0
+        start = flight.samples[0].t if flight.samples else 0.0  # as in the verdict's reasons and the list of events
         for axis in axes:
             _shade(axis, flight, start)
         _name_states(axes[0], flight, start)

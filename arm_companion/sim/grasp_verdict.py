@@ -3,6 +3,7 @@
 import math
 import statistics
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 from arm_companion.config.schema import Config
 from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight
@@ -17,6 +18,7 @@ _LIFTED_SHARE = 0.7
 _STILL_M = 0.003
 _ASKED_UP_M = 0.002
 _CLEAR_S = 1.0
+_FELL_M_PER_S = 0.5  # it is set down at a fifth of that
 _SETTLED_S = 2.0
 _PICK_UP = ("VERIFY", "LIFT")
 
@@ -73,6 +75,7 @@ def judge_grasp(flight: Flight, failure: str, config: Config) -> GraspVerdict:
     placed = _moved(flight)
     if carried and not placed <= PLACED_WITHIN_M:
         reasons.append(f"the object lies {placed * 100:.1f} cm from where it was")
+    reasons += _dropped(flight)
     reasons += _left_alone(flight) if carried else []
     reasons += after(flight, perched=bool(carried)) + unharmed(flight)
     verdict = GraspVerdict(not reasons, "failed" if reasons else "grasped", "; ".join(dict.fromkeys(reasons)))
@@ -106,6 +109,16 @@ def _moved(flight: Flight) -> float:
         return math.nan
     first, last = flight.samples[0].truth.object_position_w, flight.samples[-1].truth.object_position_w
     return math.nan if first is None or last is None else math.dist(first, last)
+
+
+def _dropped(flight: Flight) -> list[str]:
+    """What is wrong with an object that fell, wherever it came to lie."""
+    fastest = 0.0
+    for a, b in pairwise(flight.samples):
+        above, below = a.truth.object_position_w, b.truth.object_position_w
+        if above is not None and below is not None and b.t > a.t:
+            fastest = max(fastest, (below[2] - above[2]) / (b.t - a.t))
+    return [f"the object fell with {fastest:.1f} m/s"] if fastest > _FELL_M_PER_S else []
 
 
 def _left_alone(flight: Flight) -> list[str]:

@@ -31,8 +31,6 @@ def judge_hang(flight: Flight, failure: str, weight_n: float) -> Verdict:
         reasons.append(fell)
     reasons += after(flight, perched=bool(hung))
     reasons += unharmed(flight)
-    if (struck := next((s for s in flight.samples if s.truth.rotor_contact), None)) is not None:
-        reasons.append(f"a propeller struck something at {struck.t - flight.samples[0].t:.1f} s")
     verdict = Verdict(not reasons, "hung" if not reasons else "failed", "; ".join(dict.fromkeys(reasons)))
     verdict.states = flight.durations()
     if hung:

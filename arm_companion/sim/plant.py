@@ -17,7 +17,7 @@ from arm_companion.config.schema import Config
 from arm_companion.errors import ModelError
 from arm_companion.sim import mjcf
 from arm_companion.sim.jaws import Jaws
-from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand, Vec3
+from arm_companion.sim.ports import NOTHING, PlantTruth, RigidState, RotorCommand, Touch, Vec3
 
 # Rotor drag of a small quadrotor is near linear in the air speed: 2 m/s of wind push with 0.5 N.
 _DRAG_N_PER_M_S = 0.25
@@ -86,6 +86,7 @@ class Plant:
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
         self._wrench_sum, self._steps = np.zeros((2, 3)), 0
+        self._touch = self._touched = NOTHING
         mujoco.mj_forward(model, self._data)
         self._set_pulls((0.0,) * model.ntendon)
         self._data.qacc[:] = 0.0
@@ -129,6 +130,7 @@ class Plant:
         self._wrench = self._interface_wrench()
         self._wrench_sum += self._wrench
         self._steps += 1
+        self._touched = self._touched.and_then(self._touch)
 
     def state(self) -> RigidState:
         """True motion of the airframe now; the specific force is the last step's mean."""
@@ -168,6 +170,11 @@ class Plant:
         force, torque = self._wrench if not self._steps else (_vec3(v) for v in self._wrench_sum / self._steps)
         self._wrench_sum[:], self._steps = 0.0, 0
         return force, torque
+
+    def touched(self) -> Touch:
+        """What the airframe touched in the steps since this was asked last: a bump is over within milliseconds."""
+        touched, self._touched = self._touched, NOTHING
+        return touched
 
     def move_bar(self, position_w: Sequence[float]) -> None:
         """Put the bar elsewhere, with its heading kept.
@@ -226,11 +233,8 @@ class Plant:
         force, torque = self._wrench
         contact, net, wrap = self._bar_contact()
         bodies = model.geom_bodyid[data.contact.geom]
-        ground = np.isin(bodies, list(self._ground))
-        outside = np.any(ground | (bodies == self._bar), axis=1)
+        ground = np.any(np.isin(bodies, list(self._ground)), axis=1)
         thing = np.any(bodies == self._object, axis=1)
-        touching = outside & np.any(bodies == self._airframe, axis=1)
-        by_mount = np.any(data.contact.geom == self._mount, axis=1)
         tension = self.tensions()
         mujoco.mj_kinematics(model, data)  # the tip where it is after the step, as in `state`
         return PlantTruth(
@@ -241,11 +245,11 @@ class Plant:
             wrap_angle=wrap,
             tension=tension,
             tip_position_w=mjcf.up(data.site_xpos[self._tip].tolist()),
-            body_contact=bool(np.any(touching)),
-            mount_only=bool(np.any(touching) and np.all(by_mount[touching])),
-            rotor_contact=bool(np.any(np.isin(data.contact.geom, self._rotors))),
+            body_contact=self._touch.body,
+            mount_only=self._touch.mount_only,
+            rotor_contact=self._touch.rotor,
             object_position_w=None if self._object < 0 else mjcf.up(data.xpos[self._object].tolist()),
-            object_supported=bool(np.any(thing & np.any(ground, axis=1))),
+            object_supported=bool(np.any(thing & ground)),
         )
 
     def _interface_wrench(self) -> tuple[Vec3, Vec3]:
@@ -266,11 +270,26 @@ class Plant:
         x, y, z = (data.subtree_com[self._airframe] - data.xpos[self._airframe]).tolist()
         force = (-fx, -fy, -fz)
         torque = (z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz)
+        self._touch = NOTHING
         if data.ncon and np.any(model.geom_bodyid[data.contact.geom] == self._airframe):
+            self._touch = self._look_at_airframe()
             pushed, twisted = self._arm_against_airframe()
             force, torque = _vec3(pushed + force), _vec3(twisted + torque)
         turn = data.xmat[self._airframe].reshape(3, 3).T.tolist()
         return _turned(turn, force), _turned(turn, torque)
+
+    def _look_at_airframe(self) -> Touch:
+        """What the airframe touches in this step."""
+        geoms = self._data.contact.geom
+        bodies = self._model.geom_bodyid[geoms]
+        outside = np.any(np.isin(bodies, [*self._ground, self._bar]), axis=1)
+        touching = outside & np.any(bodies == self._airframe, axis=1)
+        by_mount = np.any(geoms == self._mount, axis=1)
+        return Touch(
+            by_mount=bool(np.any(touching & by_mount)),
+            elsewhere=bool(np.any(touching & ~by_mount)),
+            rotor=bool(np.any(np.isin(geoms, self._rotors))),
+        )
 
     def _arm_against_airframe(self) -> tuple[Array, Array]:
         """Force and torque, world axes up, about the airframe's centre of mass, of links that lie against it."""

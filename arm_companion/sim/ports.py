@@ -44,3 +44,31 @@ class PlantTruth:
     rotor_contact: bool = False  # something, the arm too, reaches into a propeller's disk
     object_position_w: Vec3 | None = None  # m, middle of the object; None: there is none
     object_supported: bool = False  # it touches cradles or ground
+
+
+@dataclass(frozen=True, slots=True)
+class Touch:
+    """What the airframe touches: bar, object, cradles or ground, with the arm's mount or elsewhere."""
+
+    by_mount: bool = False
+    elsewhere: bool = False
+    rotor: bool = False  # something, the arm too, reaches into a propeller's disk
+
+    @property
+    def body(self) -> bool:
+        """Any of the first two."""
+        return self.by_mount or self.elsewhere
+
+    @property
+    def mount_only(self) -> bool:
+        """Nothing touches but the mount."""
+        return self.by_mount and not self.elsewhere
+
+    def and_then(self, later: "Touch") -> "Touch":
+        """What was touched in either."""
+        if later is NOTHING:
+            return self
+        return Touch(self.by_mount or later.by_mount, self.elsewhere or later.elsewhere, self.rotor or later.rotor)
+
+
+NOTHING = Touch()

@@ -76,7 +76,7 @@ def show_verdict(title: str, verdict: Verdict, console: Console, files: list[Pat
 def _show_forces(verdict: Verdict, table: Table) -> None:
     """What touched what, and what the daemon predicted of it."""
     mean, most = verdict.contact_force_n
-    if not isinstance(verdict, ReachVerdict):
+    if not math.isnan(mean):
         table.add_row("contact force while held", f"{mean:.1f} N", f"greatest {most:.1f} N")
         table.add_row("arm around bar or object", f"{math.degrees(verdict.wrap_rad):.0f} deg", "median while held")
     for wrench in verdict.wrench:

@@ -86,8 +86,6 @@ def judge_reach(flight: Flight, failure: str) -> ReachVerdict:
                 f"at point {i} the tip was {1e3 * point.off_m:.0f} mm off, at worst {1e3 * point.worst_m:.0f}"
             )
     reasons += after(flight, perched=False) + unharmed(flight)
-    if any(sample.truth.rotor_contact for sample in flight.samples):
-        reasons.append("something reached into a propeller")
     verdict = ReachVerdict(not reasons, "failed" if reasons else "reached", "; ".join(dict.fromkeys(reasons)))
     verdict.states = flight.durations()
     verdict.points = points

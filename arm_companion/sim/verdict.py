@@ -17,6 +17,8 @@ _HELD_FORCE_N = 0.05
 _AIRBORNE_M = 0.5
 _CLEAR_S = 1.0
 _LANDED_M = 0.15
+_FELL_M_PER_S = 2.0  # no flight stack sinks or lands that fast here; a free fall does after 20 cm
+_UPRIGHT = 0.7  # cosine of the tilt of a vehicle that stands on its skids
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,8 @@ class Verdict:
     verdict: str
     reason: str
     states: list[tuple[str, float]] = field(default_factory=list)
-    contact_force_n: tuple[float, float] = (0.0, 0.0)  # mean and greatest while perched
-    wrap_rad: float = 0.0
+    contact_force_n: tuple[float, float] = (math.nan, math.nan)  # mean and greatest while held; nan: never held
+    wrap_rad: float = math.nan
     wrench: list[WrenchError] = field(default_factory=list)
     moves: list[Move] = field(default_factory=list)
     leaned_s: float = 0.0  # with nothing but the arm's mount against the bar
@@ -108,7 +110,7 @@ def _held(perched: list[Sample]) -> float:
 
 
 def after(flight: Flight, *, perched: bool) -> list[str]:
-    """What is wrong with the end: still at the bar, or not on the ground."""
+    """What is wrong with the end: still at the bar, or not on the ground, or on the ground by a fall."""
     if not flight.samples:
         return ["nothing was measured"]
     reasons = []
@@ -120,6 +122,11 @@ def after(flight: Flight, *, perched: bool) -> list[str]:
         or flight.samples[-1].state.position_w[2] < -_LANDED_M
     ):
         reasons.append("the vehicle did not land")
+    if (fastest := max(s.state.velocity_w[2] for s in flight.samples)) > _FELL_M_PER_S:
+        reasons.append(f"the vehicle fell with {fastest:.1f} m/s")
+    _, x, y, _ = flight.samples[-1].state.attitude_wb
+    if 1.0 - 2.0 * (x * x + y * y) < _UPRIGHT:
+        reasons.append("the vehicle lies on its side")
     return reasons
 
 
@@ -137,15 +144,21 @@ def excursion(flight: Flight) -> float:
 
 
 def unharmed(flight: Flight, *, leaning: bool = False) -> list[str]:
-    """What must never happen: the airframe, but its mount where it may lean, touches bar or ground while it flies."""
+    """What must never happen: the airframe, but its mount where it may lean, touches bar or ground while it flies.
+
+    Nor may anything, the arm too, reach into a propeller.
+    """
+    reasons = []
     touching = [
         s
         for s in flight.samples
         if s.state.position_w[2] < -_AIRBORNE_M and s.truth.body_contact and not (leaning and s.truth.mount_only)
     ]
-    if not touching:
-        return []
-    return [f"the airframe touched something in flight at {touching[0].t - flight.samples[0].t:.1f} s"]
+    if touching:
+        reasons.append(f"the airframe touched something in flight at {touching[0].t - flight.samples[0].t:.1f} s")
+    if (struck := next((s for s in flight.samples if s.truth.rotor_contact), None)) is not None:
+        reasons.append(f"a propeller struck something at {struck.t - flight.samples[0].t:.1f} s")
+    return reasons
 
 
 def wrench_errors(flight: Flight, kinds: Mapping[str, Sequence[str]]) -> list[WrenchError]:

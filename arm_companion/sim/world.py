@@ -31,7 +31,10 @@ _TICKS_PER_RAD = 4096 / (2.0 * math.pi)
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The truth at one instant, with the loop time at which it held; its wrench is the mean since the sample before."""
+    """The truth at one instant, with the loop time at which it held; its wrench is the mean since the sample before.
+
+    What the airframe touches is all that it touched since then.
+    """
 
     t: float
     state: RigidState
@@ -122,7 +125,15 @@ class World:
                 periods += 1
                 if periods % sampled == 0:
                     force, torque = self.plant.mean_wrench()
-                    truth = replace(self.plant.truth(), force_b=force, torque_b=torque)
+                    touched = self.plant.touched()
+                    truth = replace(
+                        self.plant.truth(),
+                        force_b=force,
+                        torque_b=torque,
+                        body_contact=touched.body,
+                        mount_only=touched.mount_only,
+                        rotor_contact=touched.rotor,
+                    )
                     self.samples.append(Sample(tick.now, self.plant.state(), truth))
 
     def _advance(self) -> None:

@@ -361,3 +361,20 @@ def test_commands_that_are_no_numbers_are_refused_and_change_nothing() -> None:
     assert world.time == 0.0
     run(world, 0.01)
     assert world.time == pytest.approx(0.01)
+
+
+def test_a_bump_between_two_looks_is_remembered_and_told_once() -> None:
+    world = Plant(Config())
+    run(world, 0.5, RotorCommand(1.3 * WEIGHT, (0.0, 0.0, 0.0)))
+    world.touched()
+    where = beside(world, (0.18, 0.0, -0.08))
+    world.move_bar(where)
+    run(world, 0.004, HOVER)
+    world.move_bar((50.0, 0.0, -2.0))
+    run(world, 0.036, HOVER)
+    assert not world.truth().body_contact, "the bar is gone again"
+    touched = world.touched()
+    assert touched.body
+    assert touched.rotor
+    assert not touched.mount_only
+    assert not world.touched().body

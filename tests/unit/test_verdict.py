@@ -5,9 +5,11 @@ from dataclasses import replace
 
 import pytest
 
+from arm_companion.config import load
 from arm_companion.sim.flight import Flight, WrenchSeen
+from arm_companion.sim.grasp_verdict import judge_grasp
 from arm_companion.sim.ports import PlantTruth, RigidState
-from arm_companion.sim.verdict import excursion, wrench_errors
+from arm_companion.sim.verdict import after, excursion, unharmed, wrench_errors
 from arm_companion.sim.world import Sample
 
 ZERO = (0.0, 0.0, 0.0)
@@ -54,3 +56,42 @@ def test_there_is_no_excursion_of_an_arm_that_never_let_go_or_of_a_vehicle_that_
     assert free.asked_at(0.0) is not None
     assert free.asked_at(-1.0) is None
     assert free.asked_at(3.5) is None
+
+
+def landed(*, fell: float = 0.0, attitude: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)) -> Flight:
+    """A flight that stands on the ground in the end, after it has sunk with `fell` m/s for a moment."""
+    made = flight({})
+    made.samples[200] = replace(made.samples[200], state=replace(STILL, velocity_w=(0.0, 0.0, fell)))
+    made.samples[-1] = replace(made.samples[-1], state=replace(STILL, attitude_wb=attitude))
+    return made
+
+
+def test_a_vehicle_that_fell_to_the_ground_has_not_landed() -> None:
+    assert after(landed(fell=1.5), perched=True) == []
+    assert after(landed(fell=6.0), perched=True) == ["the vehicle fell with 6.0 m/s"]
+    assert after(landed(attitude=(0.0, 1.0, 0.0, 0.0)), perched=True) == ["the vehicle lies on its side"]
+
+
+def test_an_arm_that_reached_into_a_propeller_is_harm_in_every_scenario() -> None:
+    seen = landed()
+    assert unharmed(seen) == []
+    seen.samples[100] = replace(seen.samples[100], truth=replace(TRUTH, rotor_contact=True))
+    assert unharmed(seen, leaning=True) == ["a propeller struck something at 4.0 s"]
+
+
+def test_an_object_that_fell_was_not_put_back_wherever_it_lies() -> None:
+    def carried(drop: float) -> Flight:
+        """Lifted by 0.4 m and let down by 0.1 m/s, but for the last `drop` m."""
+        made = flight({})
+        times = [sample.t for sample in made.samples]
+        heights = [min(0.4, 0.1 * t, max(0.9 - 0.1 * t, 0.0)) for t in times]
+        heights = [0.0 if t > 5.0 and h < drop else h for t, h in zip(times, heights, strict=True)]
+        made.samples = [
+            replace(s, truth=replace(TRUTH, object_position_w=(3.0, 0.0, -1.5 - h)))
+            for s, h in zip(made.samples, heights, strict=True)
+        ]
+        return made
+
+    config = load("sim_grasp.toml")
+    assert "fell" not in judge_grasp(carried(0.0), "", config).reason
+    assert "the object fell with" in judge_grasp(carried(0.1), "", config).reason
