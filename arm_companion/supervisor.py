@@ -1,13 +1,16 @@
 """The daemon's life: priority, readiness and watchdog for systemd, stop on SIGTERM, all under one TaskGroup."""
 
 import asyncio
+import contextlib
 import ctypes
 import logging
 import os
 import resource
 import signal
 import socket
-from collections.abc import Awaitable, Callable
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from types import FrameType
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +103,22 @@ def stop_on_signals(stop: asyncio.Event) -> Callable[[], None]:
             loop.remove_signal_handler(number)
 
     return restore
+
+
+@contextlib.contextmanager
+def ending_on_terminate() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP end this process as Ctrl-C does, so that what it started ends too."""
+
+    def leave(number: int, _frame: FrameType | None) -> None:
+        logging.getLogger("asyncio").disabled = True  # tasks that this ends in their midst are no news
+        sys.exit(128 + number)
+
+    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class _StopRequested(Exception):

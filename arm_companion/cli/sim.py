@@ -2,19 +2,22 @@
 
 import argparse
 import asyncio
+import contextlib
 import importlib.util
 import json
-import math
 import os
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from arm_companion.cli import sitl
 from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
+from arm_companion.cli.sim_summary import number, summary
 from arm_companion.config import Config
 from arm_companion.errors import ArmError, ConfigError
+from arm_companion.supervisor import ending_on_terminate
 
 _CONFIGS = {
     "perch": "sim.toml",
@@ -115,12 +118,23 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.settings.append(f"sim.seed={arguments.seed}")
     config = load_from(arguments)
     if arguments.trials is not None:
-        return _trials(arguments, config)
-    arguments.output.mkdir(parents=True, exist_ok=True)
+        with ending_on_terminate():
+            return _trials(arguments, config)
+    _make_folder(arguments.output)
     if arguments.sitl_connect:
         return sitl.check_running(arguments)
     _truth_path(arguments).unlink(missing_ok=True)  # the report must not take an earlier run's for this one's
-    return _serve(arguments, config) if arguments.scenario == "world" else _fly(arguments, config)
+    if arguments.scenario == "world":
+        return _serve(arguments, config)
+    with ending_on_terminate():  # it ends the daemon and the flight stack too, as Ctrl-C does
+        return _fly(arguments, config)
+
+
+def _make_folder(output: Path) -> None:
+    try:
+        output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"--output {output}: {error.strerror}") from error
 
 
 def _no_video(arguments: argparse.Namespace) -> str:
@@ -160,6 +174,7 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
     from arm_companion.sim.world import World  # noqa: PLC0415
 
     output: Path = arguments.output
+    figure, log = output / f"{arguments.scenario}.png", output / "events.log"
     started = time.perf_counter()
     progress = Progress(sys.stderr if arguments.json else sys.stdout)
     fly = _simulated if arguments.simulated else _real_time
@@ -174,6 +189,8 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
 
     try:
         with sitl.flying(arguments, config) as stack:
+            for old in filter(None, (figure, log, output / "daemon.log", arguments.video)):
+                old.unlink(missing_ok=True)  # a flight that fails leaves none of an earlier one's behind
             result = fly(arguments, config, progress, prepare, stack)
     except ConfigError:
         raise
@@ -182,20 +199,16 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
         return 1
     scenario = SCENARIOS[arguments.scenario]
     verdict = scenario.judge(result.flight, result.failure, config)
-    figure = output / f"{arguments.scenario}.png"
-    draw(result.flight, config, f"{scenario.title}: {verdict.verdict}", figure)
-    log = output / "events.log"
-    start = result.flight.samples[0].t if result.flight.samples else 0.0
-    log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in result.flight.texts), encoding="utf-8")
-    _write_truth(arguments, result.flight)
+    title = f"{scenario.title}: {verdict.verdict}"
+    written = _written(arguments, result.flight, lambda: draw(result.flight, config, title, figure), log)
     files = [figure, log, _record_path(arguments)]
-    filmed = studio is None or _film(arguments.video, config, result.poses, studio, progress.console)
-    if studio is not None and filmed:
+    if studio is not None:
+        written = _film(arguments.video, config, result.poses, studio, progress.console) and written
         files.append(arguments.video)
     show_verdict(scenario.title, verdict, progress.console, files)
     if arguments.json:
         wall = time.perf_counter() - started
-        print(json.dumps(_summary(arguments.scenario, verdict, result, wall)))
+        print(json.dumps(summary(arguments.scenario, verdict, result, wall)))
     if not verdict.success and result.lost_s > _LOST_S:
         print(
             f"arm-companion sim: no fair flight: this machine fell {result.lost_s:.1f} s behind real time; "
@@ -203,7 +216,7 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
             file=sys.stderr,
         )
         return TOO_SLOW
-    return 0 if verdict.success and filmed else 1
+    return 0 if verdict.success and written else 1
 
 
 def _film(path: Path, config: Config, poses: Any, studio: Any, console: Any) -> bool:
@@ -214,6 +227,8 @@ def _film(path: Path, config: Config, poses: Any, studio: Any, console: Any) -> 
     try:
         film.make(path, config, poses, studio)
     except (film.NoFilm, OSError) as error:
+        with contextlib.suppress(OSError):  # half a film is none
+            path.unlink(missing_ok=True)
         print(f"arm-companion sim: {error}", file=sys.stderr)
         return False
     return True
@@ -228,39 +243,47 @@ def _trials(arguments: argparse.Namespace, config: Config) -> int:
     stream = sys.stderr if arguments.json else sys.stdout
     seeds = range(config.sim.seed, config.sim.seed + arguments.trials)
     scenario = SCENARIOS[arguments.scenario]
-    summary = fly(
+    outcome = fly(
         arguments.config,
         arguments.settings,
         seeds,
         arguments.jobs,
-        lambda outcome: show_outcome(outcome, scenario.done, stream),
+        lambda one: show_outcome(one, scenario.done, stream),
         arguments.scenario,
     )
-    show_summary(scenario.title, scenario.done, summary, stream)
+    show_summary(scenario.title, scenario.done, outcome, stream)
     if arguments.json:
-        low, high = summary.interval
+        low, high = outcome.interval
         contract = {
             "scenario": arguments.scenario,
-            "success": summary.success,
-            "trials": len(summary.outcomes),
-            "failures": summary.failures,
+            "success": outcome.success,
+            "trials": len(outcome.outcomes),
+            "failures": outcome.failures,
             "interval_95": [round(low, 4), round(high, 4)],
-            "harmed": summary.harmed,
-            "wrench_two_sigma_share": _number(summary.covered),
+            "harmed": outcome.harmed,
+            "wrench_two_sigma_share": number(outcome.covered),
             "seed": config.sim.seed,
             "wall_s": round(time.perf_counter() - started, 3),
         }
         print(json.dumps(contract))
-    return 0 if summary.success == len(summary.outcomes) else 1
+    return 0 if outcome.success == len(outcome.outcomes) else 1
 
 
-def _write_truth(arguments: argparse.Namespace, flight: Any) -> None:
-    """Beside the record, where `report` looks for it."""
+def _written(arguments: argparse.Namespace, flight: Any, draw: Callable[[], None], log: Path) -> bool:
+    """Write what a flight leaves, the truth where `report` looks for it; whether the disk took it, which is told."""
     from arm_companion.clock import SIMULATED_EPOCH_S, unix_now  # noqa: PLC0415
     from arm_companion.sim.truth import write_truth  # noqa: PLC0415
 
     offset = SIMULATED_EPOCH_S if arguments.simulated else unix_now() - time.perf_counter()
-    write_truth(_truth_path(arguments), flight.samples, lambda t: t + offset)
+    start = flight.samples[0].t if flight.samples else 0.0
+    try:
+        draw()
+        log.write_text("".join(f"{t - start:8.2f} s  {text}\n" for t, text in flight.texts), encoding="utf-8")
+        write_truth(_truth_path(arguments), flight.samples, lambda t: t + offset)
+    except OSError as error:  # the verdict on a flight of minutes is not lost with it
+        print(f"arm-companion sim: {error}", file=sys.stderr)
+        return False
+    return True
 
 
 def _record_path(arguments: argparse.Namespace) -> Path:
@@ -305,81 +328,3 @@ def _daemon_words(arguments: argparse.Namespace) -> list[str]:
     if arguments.live is not None:
         words += ["--live", str(arguments.live)]
     return words
-
-
-def _summary(scenario: str, verdict: Any, result: Any, wall_s: float) -> dict[str, Any]:
-    """The command-line contract of `sim --json`."""
-    held = verdict.held
-    errors = {move.name: move.error_m for move in verdict.moves}  # the same move with and without compensation
-    samples = result.flight.samples
-    contract = {
-        "scenario": scenario,
-        "verdict": verdict.verdict,
-        "reason": verdict.reason,
-        "states": [{"name": name, "seconds": round(seconds, 3)} for name, seconds in verdict.states],
-        "wrench_rms_error_n": _number(held.force_error_n if held else math.nan),
-        "wrench_rms_n": _number(held.true_force_n if held else math.nan),
-        "wrench_two_sigma_share": _number(held.covered if held else math.nan),
-        "pose_error_with_m": _number(errors.get("pull x", math.nan)),
-        "pose_error_without_m": _number(errors.get("pull x, not compensated", math.nan)),
-        "moves": [{"name": m.name, "made_m": _number(m.made_m), "error_m": _number(m.error_m)} for m in verdict.moves],
-        "excursion_after_release_m": _number(verdict.excursion_m),
-        "cycles": result.cycles,
-        "missed_cycles": result.missed,
-        "lost_s": round(result.lost_s, 3),
-        "wall_s": round(wall_s, 3),
-        "simulated_s": round(samples[-1].t - samples[0].t, 3) if samples else 0.0,
-    }
-    further = {"grasp": _grasp_summary, "abort": _abort_summary, "reach": _reach_summary}.get(scenario, lambda _: {})
-    return contract | further(verdict)
-
-
-def _abort_summary(verdict: Any) -> dict[str, Any]:
-    """What a flight with aborts has besides."""
-    return {
-        "aborts": [
-            {"state": a.state, "let_go_s": _number(a.let_go_s), "sank_m": _number(a.sank_m)} for a in verdict.aborts
-        ]
-    }
-
-
-def _reach_summary(verdict: Any) -> dict[str, Any]:
-    """What a flight to points has besides."""
-    return {
-        "points": [
-            {
-                "asked_m": list(p.asked_w),
-                "off_m": _number(p.off_m),
-                "worst_m": _number(p.worst_m),
-                "seconds": _number(p.took_s),
-            }
-            for p in verdict.points
-        ]
-    }
-
-
-def _grasp_summary(verdict: Any) -> dict[str, Any]:
-    """What a grasp has besides: the errors are those of the height while the load came on, RMS."""
-    errors = {pick_up.name: pick_up.error_m for pick_up in verdict.pick_ups}
-    return {
-        "pose_error_with_m": _number(errors.get("grasp", math.nan)),
-        "pose_error_without_m": _number(errors.get("grasp, not compensated", math.nan)),
-        "pick_ups": [
-            {
-                "name": p.name,
-                "error_m": _number(p.error_m),
-                "aside_m": _number(p.aside_m),
-                "seconds": _number(p.seconds),
-            }
-            for p in verdict.pick_ups
-        ],
-        "payload_mass_kg": _number(verdict.weighed_kg),
-        "payload_mass_sigma_kg": _number(verdict.weighed_sigma_kg),
-        "payload_mass_true_kg": _number(verdict.mass_kg),
-        "payload_mass_error": _number(verdict.mass_error),
-        "placed_off_m": _number(verdict.placed_m),
-    }
-
-
-def _number(value: float) -> float | None:
-    return None if math.isnan(value) else round(value, 6)

@@ -12,14 +12,12 @@ import select
 import shutil
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 from arm_companion.clock import ticks
@@ -29,6 +27,7 @@ from arm_companion.sim import sitl_ardupilot, sitl_px4
 from arm_companion.sim.capture import Capture, CaptureLine
 from arm_companion.sim.ports import RigidState, RotorCommand
 from arm_companion.sim.sitl_relay import Relay
+from arm_companion.supervisor import ending_on_terminate
 from arm_companion.transport.base import Opener
 
 STACKS = ("ardupilot", "px4")
@@ -289,7 +288,7 @@ def running(
             capture_port=None if line is None else line.port,
             more=_with_scripts(directory, scripts),
         )
-        undo.enter_context(_ending_on_terminate())
+        undo.enter_context(ending_on_terminate())
         process = undo.enter_context(_started(how, directory, log))
         yield Sitl(bridge, process, log, relay)
 
@@ -365,21 +364,6 @@ def _runs(process: subprocess.Popen[bytes]) -> bool:
     if process.returncode is not None:
         return False
     return os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is None
-
-
-@contextlib.contextmanager
-def _ending_on_terminate() -> Iterator[None]:
-    """Let SIGTERM and SIGHUP end this process as Ctrl-C does, so that what it started ends too."""
-
-    def leave(number: int, _frame: FrameType | None) -> None:
-        sys.exit(128 + number)
-
-    before = {number: signal.signal(number, leave) for number in (signal.SIGTERM, signal.SIGHUP)}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _last_words(log: Path) -> str:

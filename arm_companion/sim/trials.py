@@ -31,7 +31,15 @@ _BAR_ERROR_DEG = 2.0
 _WIND_M_PER_S = 2.0
 _MASS_SHARE = (0.75, 1.5)  # of the configured object's
 _CONFIDENCE = 0.95
-_HARM = ("airframe", "propeller", "did not land", "the hanging vehicle")
+_HARM = (
+    "airframe",
+    "propeller",
+    "did not land",
+    "the hanging vehicle",
+    "the vehicle fell",
+    "the vehicle lies",
+    "the object fell",
+)
 _OVER = 1.05  # of the tension limit, from which the plant's truth counts as a limit broken: the servos' own overshoot
 
 
@@ -186,6 +194,8 @@ def draw(config: Config, seed: int) -> Draw:
     )
     if config.sim.object.mass_kg:
         controller, world = (_with_object(one, config, _others(seed)) for one in (controller, world))
+        if given := config.sim.object.friction:
+            share["friction"] = world.sim.object.friction / given
     words = ", ".join(f"{name} {100 * (value - 1):+.0f} %" for name, value in share.items())
     name = "bar"
     if (thing := world.sim.object).mass_kg:
@@ -279,6 +289,7 @@ def fly(
     """
     spawn = multiprocessing.get_context("spawn")
     outcomes: list[Outcome] = []
+    others = set(multiprocessing.active_children())
     with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
         waiting = [pool.submit(fly_one, file, tuple(settings), seed, scenario) for seed in seeds]
         try:
@@ -287,5 +298,7 @@ def fly(
                 told(outcomes[-1])
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            for ours in set(multiprocessing.active_children()) - others:  # the flights under way would be waited for
+                ours.terminate()
             raise
     return Summary(tuple(sorted(outcomes, key=lambda outcome: outcome.seed)))

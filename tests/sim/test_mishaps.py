@@ -1,5 +1,6 @@
 """Gusts, and perches that are taken back: the wind itself, the verdict on aborts, and the flights."""
 
+import io
 import json
 import math
 from itertools import pairwise
@@ -8,15 +9,18 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from arm_companion.__main__ import main
 from arm_companion.cli import sim as cli
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
+from arm_companion.errors import LinkError
 from arm_companion.sim.abort_verdict import LET_GO_WITHIN_S, judge_aborts
 from arm_companion.sim.flight import Flight, Mark
 from arm_companion.sim.mishaps import ABORTED_IN, fly_aborts, fly_in_gusts, fly_one_abort
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
+from arm_companion.sim.progress import show_verdict
 from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.verdict import judge
 from arm_companion.sim.wind import Wind
@@ -135,3 +139,47 @@ def test_a_vehicle_perches_in_gusts_and_stays_perched_in_them() -> None:
     verdict = judge(result.flight, result.failure, leaning=True)
     assert verdict.success, verdict.reason
     assert max(max(s.truth.tension) for s in result.flight.samples) < 1.05 * config.limits.tension_max_n
+
+
+@pytest.mark.scenario
+def test_an_abort_in_a_state_that_never_came_is_none() -> None:
+    config = load("sim.toml", ("sim.seed=3", "sim.bar.position_m=[3.1, 0.0, -2.0]"))
+    assert ABORTED_IN[3 % len(ABORTED_IN)] == "WRAP"
+    result = run_simulated(fly_simulated(config, lambda _: None, fly=fly_one_abort))
+    verdict = judge_aborts(result.flight, result.failure)
+    assert not verdict.success
+    assert verdict.aborts == []
+    assert "ended before WRAP" in verdict.reason
+
+
+def test_the_table_of_aborts_shows_no_force_that_nobody_measured() -> None:
+    stream = io.StringIO()
+    show_verdict("Aborted perches", judge_aborts(aborted(6.0), ""), Console(file=stream, width=200), [])
+    assert "abort in WRAP" in stream.getvalue()
+    assert "contact force" not in stream.getvalue()
+
+
+@pytest.mark.parametrize("how", ["fails", "no disk"])
+def test_a_flight_leaves_nothing_of_an_earlier_one_and_its_verdict_whatever_the_disk_does(
+    how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fly(*_: object) -> Result:
+        if how == "fails":
+            raise LinkError("no port")
+        (tmp_path / "events.log").mkdir()
+        return Result(aborted(6.0), "")
+
+    for name in ("perch.png", "events.log", "daemon.log"):
+        (tmp_path / name).write_text("of the day before", encoding="utf-8")
+    monkeypatch.setattr(cli, "_simulated", fly)
+    assert main(["sim", "perch", "--simulated", "--output", str(tmp_path)]) == 1
+    assert not any(path.is_file() and b"day before" in path.read_bytes() for path in tmp_path.iterdir())
+    out, err = capsys.readouterr()
+    assert ("verdict: failed" in out) is (how == "no disk")
+    assert ("no port" if how == "fails" else "Is a directory") in err
+
+
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").touch()
+    assert main(["sim", "perch", "--simulated", "--output", str(tmp_path / "file")]) == 78
+    assert "--output" in capsys.readouterr().err

@@ -2,7 +2,12 @@
 
 import json
 import math
+import signal
+import subprocess
+import sys
+import time
 from concurrent.futures import Future
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any, Self
 
@@ -50,6 +55,7 @@ def test_an_object_is_drawn_too_and_told_with_an_error(seed: int) -> None:
     assert drawn.controller.sim.object == thing
     assert 0.15 <= thing.mass_kg <= 0.3
     assert abs(thing.friction / GRASP.sim.object.friction - 1.0) <= MODEL_ERROR
+    assert f"friction {100 * (thing.friction / GRASP.sim.object.friction - 1):+.0f} %" in drawn.words
     errors = [a - b for a, b in zip(told.object_position_m, thing.position_m, strict=True)]
     assert max(map(abs, errors)) <= 0.010 + 1e-9
     assert abs(told.object_axis_deg - thing.axis_deg) <= 2.0
@@ -158,3 +164,19 @@ def test_what_a_process_raises_is_seen_here() -> None:
     """Two processes that fail at once: what they raise is seen here, and no process is left behind."""
     with pytest.raises(Exception, match="no_such_key"):
         trials.fly("sim.toml", ["sim.no_such_key=1"], range(2), 2)
+
+
+def test_sigterm_ends_the_processes_that_fly_too(tmp_path: Path) -> None:
+    words = ["sim", "perch", "--simulated", "--trials", "4", "--jobs", "2", "--output", str(tmp_path)]
+    process = subprocess.Popen([sys.executable, "-m", "arm_companion", *words], stderr=subprocess.PIPE, text=True)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    until = time.monotonic() + 60.0
+    while len(flying := children.read_text(encoding="ascii").split()) < 3 and time.monotonic() < until:
+        time.sleep(0.05)  # two that fly, and what tracks their resources
+    process.send_signal(signal.SIGTERM)
+    process.communicate(timeout=20.0)
+    assert process.returncode == 128 + signal.SIGTERM
+    assert len(flying) == 3
+    while any(Path(f"/proc/{child}").exists() for child in flying) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert not [child for child in flying if Path(f"/proc/{child}").exists()]
