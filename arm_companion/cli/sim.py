@@ -189,7 +189,8 @@ def _fly(arguments: argparse.Namespace, config: Config) -> int:
 
     try:
         with sitl.flying(arguments, config) as stack:
-            for old in filter(None, (figure, log, output / "daemon.log", arguments.video)):
+            places = (figure, log, output / "daemon.log", _record_path(arguments), arguments.video)
+            for old in filter(None, places):
                 old.unlink(missing_ok=True)  # a flight that fails leaves none of an earlier one's behind
             result = fly(arguments, config, progress, prepare, stack)
     except ConfigError:

@@ -169,7 +169,7 @@ def test_a_flight_leaves_nothing_of_an_earlier_one_and_its_verdict_whatever_the_
         (tmp_path / "events.log").mkdir()
         return Result(aborted(6.0), "")
 
-    for name in ("perch.png", "events.log", "daemon.log"):
+    for name in ("perch.png", "events.log", "daemon.log", "record.mcap"):
         (tmp_path / name).write_text("of the day before", encoding="utf-8")
     monkeypatch.setattr(cli, "_simulated", fly)
     assert main(["sim", "perch", "--simulated", "--output", str(tmp_path)]) == 1

@@ -95,3 +95,10 @@ def test_an_object_that_fell_was_not_put_back_wherever_it_lies() -> None:
     config = load("sim_grasp.toml")
     assert "fell" not in judge_grasp(carried(0.0), "", config).reason
     assert "the object fell with" in judge_grasp(carried(0.1), "", config).reason
+
+
+def test_an_arm_at_the_bar_is_seen_though_the_machine_stood_still_at_the_end() -> None:
+    seen = landed()
+    seen.samples[-1] = replace(seen.samples[-1], truth=replace(TRUTH, contact_force_n=1.0))
+    seen.end += 3.0
+    assert after(seen, perched=True) == ["the arm did not let go of the bar"]
