@@ -54,6 +54,9 @@ _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, P
 _ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _ORDER_OF_SETTING_DOWN = (Phase.PLACE, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
 _CURLS = (Phase.WRAP, Phase.CLOSE)
+_FLIES = frozenset({Phase.APPROACH, Phase.DEPART})
+"""Phases that fly some way: whoever is not told that it brakes at its end overshoots by a quarter of a metre."""
+
 _WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
@@ -223,8 +226,9 @@ def setpoint(s: Situation) -> Setpoint | None:
     reference = s.state.reference
     if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
-    path = s.state.lean if s.state.phase in TIP else ZERO
-    return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, path)
+    path = s.state.lean if s.state.phase in TIP else reference.acceleration if s.state.phase in _FLIES else ZERO
+    push = path if s.state.phase in TIP else add(path, s.state.lean)
+    return Setpoint(reference.position, reference.velocity, push, reference.yaw, path)
 
 
 def progress(s: Situation) -> int:
