@@ -226,9 +226,12 @@ def setpoint(s: Situation) -> Setpoint | None:
     reference = s.state.reference
     if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
-    path = s.state.lean if s.state.phase in TIP else reference.acceleration if s.state.phase in _FLIES else ZERO
-    push = path if s.state.phase in TIP else add(path, s.state.lean)
-    return Setpoint(reference.position, reference.velocity, push, reference.yaw, path)
+    if s.state.phase in TIP:
+        return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, s.state.lean)
+    # ArduPilot goes on for GUID_TIMEOUT with what it was told last: braking, it would fly back to the bar
+    told = s.state.phase in _FLIES and s.config.vehicle.autopilot != "ardupilot"
+    path = reference.acceleration if told else ZERO
+    return Setpoint(reference.position, reference.velocity, add(path, s.state.lean), reference.yaw, path)
 
 
 def progress(s: Situation) -> int:

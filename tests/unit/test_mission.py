@@ -109,6 +109,11 @@ def test_on_the_way_to_the_bar_set_points_have_the_acceleration_of_their_path(
     assert norm(sent[-1].acceleration_w) > 0.3
     for setpoint in sent:
         assert setpoint.acceleration_w == setpoint.path_w, "none of it is a force"
+    # ArduPilot goes on for three seconds with the acceleration that it heard last, when the set-points stop
+    config = parameters.config
+    flown = dataclasses.replace(config, vehicle=dataclasses.replace(config.vehicle, autopilot="ardupilot"))
+    _, said = run(at(Phase.APPROACH), hovering(), dataclasses.replace(parameters, config=flown), 0.5)
+    assert {c.setpoint.acceleration_w for c in said if c.setpoint is not None} == {(0.0, 0.0, 0.0)}
     feeling = dataclasses.replace(state, phase=Phase.REACH)
     _, said = run(feeling, hovering(), parameters, 0.1)
     assert [commands.setpoint.path_w for commands in said if commands.setpoint is not None][-1] == (0.0, 0.0, 0.0)
