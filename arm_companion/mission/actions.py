@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission import calibrating, carry, gripper, reaching
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
@@ -66,6 +67,8 @@ _FAR_FACTOR = 3.0
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
 _AT_REST_M = 0.002
+_EASE_PER_S = 2.0
+_PRESSED_SIGMA = 0.5  # of the force, with which the rotors must tell it
 _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
 _AT_BEND_RAD = 1e-6
 _TIGHTEN_SHARE = 0.5  # of the bend's speed, beyond the full wrap
@@ -395,16 +398,23 @@ def _trim(s: Situation) -> float:
     """Downward acceleration that makes a vertical move against a wrap which slides on its bar, m/s^2.
 
     How hard the bar's friction holds on, no elastic model knows. So the force is found: it grows with the error
-    until the vehicle moves, never beyond `perch.slide_force_n`, and only while a vertical move is asked for.
-    docs/adr/0017 has the margin to instability.
+    until the vehicle moves, never beyond `perch.slide_force_n`, and only while a vertical move is asked for. The
+    autopilot pushes too, the longer the harder: what the rotors say of both together stays within that force, else
+    the ring around the bar tips over. docs/adr/0017 has the margin to instability.
     """
     down = s.state.offset[2]
     if not down or not s.vehicle_fresh:
         return 0.0
     error = s.rest[2] + down - s.state.position[2]
     most = s.config.perch.slide_force_n
-    force = s.state.lean[2] * s.config.vehicle.mass_kg + _TRIM_N_PER_M_S * error * s.dt
-    return min(max(force, -most), most) / s.config.vehicle.mass_kg
+    mass, load = s.config.vehicle.mass_kg, s.state.load
+    change = _TRIM_N_PER_M_S * error
+    if math.isfinite(load.now) and load.sigma_now(mass) * GRAVITY < _PRESSED_SIGMA * most:
+        pressed = -load.now * GRAVITY
+        beyond = pressed - min(max(pressed, -most), most)
+        change = -_EASE_PER_S * beyond if beyond else change
+    force = s.state.lean[2] * mass + change * s.dt
+    return min(max(force, -most), most) / mass
 
 
 def _bend_towards(bend: tuple[float, float], goal: tuple[float, float], most: float) -> tuple[float, float]:
