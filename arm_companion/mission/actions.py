@@ -55,9 +55,6 @@ _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, P
 _ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _ORDER_OF_SETTING_DOWN = (Phase.PLACE, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
 _CURLS = (Phase.WRAP, Phase.CLOSE)
-_FLIES = frozenset({Phase.APPROACH, Phase.DEPART})
-"""Phases that fly some way: whoever is not told that it brakes at its end overshoots by a quarter of a metre."""
-
 _WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
@@ -229,12 +226,8 @@ def setpoint(s: Situation) -> Setpoint | None:
     reference = s.state.reference
     if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
-    if s.state.phase in TIP:
-        return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, s.state.lean)
-    # ArduPilot goes on for GUID_TIMEOUT with what it was told last: braking, it would fly back to the bar
-    told = s.state.phase in _FLIES and s.config.vehicle.autopilot != "ardupilot"
-    path = reference.acceleration if told else ZERO
-    return Setpoint(reference.position, reference.velocity, add(path, s.state.lean), reference.yaw, path)
+    path = s.state.lean if s.state.phase in TIP else ZERO
+    return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, path)
 
 
 def progress(s: Situation) -> int:

@@ -6,24 +6,15 @@ from dataclasses import dataclass
 from arm_companion.mission.facts import Vec3
 
 ZERO: Vec3 = (0.0, 0.0, 0.0)
-_MEAN_S = 0.1
 
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the vehicle is asked to be, world axes (NED).
-
-    Attributes:
-        position: m.
-        velocity: m/s.
-        yaw: rad.
-        acceleration: mean of the velocity's over the last moments, m/s^2: a tilt takes its time.
-    """
+    """Where the vehicle is asked to be, world axes (NED)."""
 
     position: Vec3
     velocity: Vec3 = ZERO
     yaw: float = 0.0
-    acceleration: Vec3 = ZERO
 
 
 def add(a: Vec3, b: Vec3) -> Vec3:
@@ -94,11 +85,9 @@ def follow(
     wanted = scale(to_go, min(speed, brake) / distance) if distance > 0.0 else ZERO
     change = clip_norm(sub(wanted, reference.velocity), acceleration * dt)
     velocity = add(reference.velocity, change)
-    there = distance <= acceleration * dt * dt and norm(reference.velocity) <= acceleration * dt * (1.0 + 1e-9)
-    position, velocity = (goal, ZERO) if there else (add(reference.position, scale(velocity, dt)), velocity)
-    pushed = scale(sub(velocity, reference.velocity), 1.0 / dt)
-    mean = add(reference.acceleration, scale(sub(pushed, reference.acceleration), dt / (_MEAN_S + dt)))
-    return Reference(position, velocity, yaw_now, mean)
+    if distance <= acceleration * dt * dt and norm(reference.velocity) <= acceleration * dt * (1.0 + 1e-9):
+        return Reference(goal, ZERO, yaw_now)
+    return Reference(add(reference.position, scale(velocity, dt)), velocity, yaw_now)
 
 
 def arrived(reference: Reference, goal: Vec3) -> bool:

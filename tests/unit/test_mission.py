@@ -22,7 +22,7 @@ from arm_companion.mission.facts import (
     WrenchReport,
     WrenchSource,
 )
-from arm_companion.mission.motion import Reference, norm
+from arm_companion.mission.motion import Reference
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Running, State
@@ -95,28 +95,6 @@ def test_perch_is_refused_with_the_reason(
     (answer,) = answers(said)
     assert answer.result is Result.TEMPORARILY_REJECTED
     assert words in answer.reason
-
-
-def test_on_the_way_to_the_bar_set_points_have_the_acceleration_of_their_path(
-    parameters: Parameters, hovering: Hovering
-) -> None:
-    """Whoever is not told that the way ends brakes by himself, behind its end."""
-    state, said = run(at(Phase.APPROACH), hovering(), parameters, 0.5)
-    sent = [commands.setpoint for commands in said if commands.setpoint is not None]
-    assert sent
-    assert state.reference is not None
-    assert norm(state.reference.velocity) > 0.1, "it has begun to fly"
-    assert norm(sent[-1].acceleration_w) > 0.3
-    for setpoint in sent:
-        assert setpoint.acceleration_w == setpoint.path_w, "none of it is a force"
-    # ArduPilot goes on for three seconds with the acceleration that it heard last, when the set-points stop
-    config = parameters.config
-    flown = dataclasses.replace(config, vehicle=dataclasses.replace(config.vehicle, autopilot="ardupilot"))
-    _, said = run(at(Phase.APPROACH), hovering(), dataclasses.replace(parameters, config=flown), 0.5)
-    assert {c.setpoint.acceleration_w for c in said if c.setpoint is not None} == {(0.0, 0.0, 0.0)}
-    feeling = dataclasses.replace(state, phase=Phase.REACH)
-    _, said = run(feeling, hovering(), parameters, 0.1)
-    assert [commands.setpoint.path_w for commands in said if commands.setpoint is not None][-1] == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize("phase", [Phase.STOWED, Phase.APPROACH, Phase.PERCHED, Phase.HOLDING])

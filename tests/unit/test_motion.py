@@ -9,12 +9,10 @@ from hypothesis import strategies as st
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
-    add,
     arrived,
     follow,
     norm,
     rotate,
-    scale,
     sub,
     unrotate,
     wrap_angle,
@@ -68,23 +66,6 @@ def test_a_reference_that_is_already_moving_still_arrives(
         if arrived(reference, goal):
             break
     assert arrived(reference, goal)
-
-
-@settings(max_examples=40, deadline=None)
-@given(points, points, st.floats(0.02, 2.0), st.floats(0.1, 3.0))
-def test_the_acceleration_of_a_reference_belongs_to_its_velocity(
-    start: tuple[float, float, float], goal: tuple[float, float, float], speed: float, acceleration: float
-) -> None:
-    """Within its bound, over the whole way it adds up to the velocity, and it ends with the way."""
-    reference, gained = Reference(start), ZERO
-    for _ in range(round((norm(sub(goal, start)) / speed + 4.0 * speed / acceleration + 2.0) / DT)):
-        reference = follow(reference, goal, 0.0, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=DT)
-        assert norm(reference.acceleration) <= acceleration * (1.0 + 1e-6)
-        gained = add(gained, scale(reference.acceleration, DT))
-        # it is a mean of the last tenth of a second: so much of the velocity's change is still to come
-        assert norm(sub(reference.velocity, gained)) <= 0.1 * acceleration * (1.0 + 1e-6) + 1e-9
-    assert arrived(reference, goal)
-    assert norm(reference.acceleration) < 1e-4 * acceleration
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1), points)
