@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from arm_companion.arm.reaction import GRAVITY
-from arm_companion.mission import calibrating, carry, gripper, reaching
+from arm_companion.mission import calibrating, carry, gripper, pressing, reaching
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
@@ -64,8 +63,6 @@ _FAR_FACTOR = 3.0
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
 _AT_REST_M = 0.002
-_EASE_PER_S = 2.0
-_PRESSED_SIGMA = 0.5  # of the force, with which the rotors must tell it
 _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
 _AT_BEND_RAD = 1e-6
 _TIGHTEN_SHARE = 0.5  # of the bend's speed, beyond the full wrap
@@ -73,7 +70,6 @@ _BEND_AHEAD_RAD = 0.25  # three times what servos lag by while they curl the arm
 _BEHIND_CURL_M = 0.1  # a wrap in still air is followed within 5 cm
 _LEAN_RATE = 1.0  # m/s^3
 _LOAD_RATE = 4.0  # m/s^3, of a load that comes on or goes off
-_TRIM_N_PER_M_S = 100.0  # growth of the vertical push, N/s for each metre that is still to go
 
 
 def prepare(s: Situation) -> State:
@@ -276,7 +272,7 @@ def _reference(s: Situation) -> Reference | None:
         beside = _beside_bar(s)
         if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(beside)):
             return replace(reference, velocity=ZERO)  # nobody knows where the bar was met
-        return Reference(beside, ZERO, state.heading)
+        return Reference(pressing.not_back_down(s, beside, reference.position), ZERO, state.heading)
     goal, speed = _goal(s)
     # an arm that is wrapped is not turned in by a heading of another place: after a restart nobody knows the bar's
     keeps = state.phase is Phase.UNLOAD and state.anchor is None
@@ -351,6 +347,8 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
             return s.place(-perch.overreach_m), hurry * perch.reach_speed_m_per_s
         case Phase.VERIFY:
             return add(anchor, scale(s.ahead, -perch.verify_pull_m)), perch.verify_pull_m
+        case Phase.UNLOAD:
+            return pressing.eased(s), _NUDGE_M_PER_S
         case phase:
             speed = perch.jog_speed_m_per_s if phase is Phase.PERCHED else _NUDGE_M_PER_S
             return add(s.rest, s.state.offset), speed
@@ -377,7 +375,7 @@ def _lean(s: Situation) -> Vec3:
     prediction = s.state.prediction
     wanted = ZERO
     if s.state.phase is Phase.PERCHED and s.state.feedforward and prediction is not None:
-        wanted = clip_norm(add(prediction.lean, (0.0, 0.0, _trim(s))), s.config.limits.feedforward_m_per_s2)
+        wanted = clip_norm(add(prediction.lean, (0.0, 0.0, pressing.trim(s))), s.config.limits.feedforward_m_per_s2)
     rate = _LEAN_RATE
     if s.grasping:
         if s.state.phase is Phase.HOLDING:  # what it held up is gone
@@ -385,29 +383,6 @@ def _lean(s: Situation) -> Vec3:
         if s.state.phase in _WITH_LOAD and s.state.feedforward:
             wanted, rate = clip_norm(carry.push(s), s.config.limits.feedforward_m_per_s2), _LOAD_RATE
     return add(s.state.lean, clip_norm(sub(wanted, s.state.lean), rate * s.dt))
-
-
-def _trim(s: Situation) -> float:
-    """Downward acceleration that makes a vertical move against a wrap which slides on its bar, m/s^2.
-
-    How hard the bar's friction holds on, no elastic model knows. So the force is found: it grows with the error
-    until the vehicle moves, never beyond `perch.slide_force_n`, and only while a vertical move is asked for. The
-    autopilot pushes too, the longer the harder: what the rotors say of both together stays within that force, else
-    the ring around the bar tips over. docs/adr/0017 has the margin to instability.
-    """
-    down = s.state.offset[2]
-    if not down or not s.vehicle_fresh:
-        return 0.0
-    error = s.rest[2] + down - s.state.position[2]
-    most = s.config.perch.slide_force_n
-    mass, load = s.config.vehicle.mass_kg, s.state.load
-    change = _TRIM_N_PER_M_S * error
-    if math.isfinite(load.now) and load.sigma_now(mass) * GRAVITY < _PRESSED_SIGMA * most:
-        pressed = -load.now * GRAVITY
-        beyond = pressed - min(max(pressed, -most), most)
-        change = -_EASE_PER_S * beyond if beyond else change
-    force = s.state.lean[2] * mass + change * s.dt
-    return min(max(force, -most), most) / mass
 
 
 def _bend_towards(bend: tuple[float, float], goal: tuple[float, float], most: float) -> tuple[float, float]:

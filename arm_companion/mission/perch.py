@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import calibrating, grasp, gripper, hang, jog, reach_table, tries
+from arm_companion.mission import calibrating, grasp, gripper, hang, jog, pressing, reach_table, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -45,6 +45,7 @@ TENSE = GRASPING | GRIPPED | CARRYING | frozenset({Phase.UNLOAD, Phase.HOLDING})
 _AT_STANDOFF_M = 0.06
 _CONTACT_PERSISTS_S = 0.15
 _SETTLE_S = 1.0
+_BACK_M = 0.002
 _AT_LIMIT_RAD = 1e-6
 _CONTACT_SETTLE_S = 2.5
 _AT_BAR_M = 0.03
@@ -183,10 +184,11 @@ def gripped(s: Situation) -> str | None:
 
 
 def unloaded(s: Situation) -> str | None:
-    """The reference is back where the vehicle rests and nothing is fed forward: letting go does not kick."""
-    reference = s.state.reference
-    back = reference is None or s.state.anchor is None or arrived(reference, s.rest)
-    return "unloaded" if s.elapsed > _SETTLE_S and back and s.state.lean == ZERO else None
+    """The reference is back where the vehicle rests and nothing presses or is fed forward: letting go does not kick."""
+    reference, ours = s.state.reference, s.external and s.state.anchor is not None
+    back = reference is None or not ours or norm(sub(reference.position, pressing.eased(s))) < _BACK_M
+    calm = back and s.state.lean == ZERO and pressing.is_eased(s)
+    return "unloaded" if calm and s.elapsed > _SETTLE_S else None
 
 
 def unwrapped(s: Situation) -> str | None:
