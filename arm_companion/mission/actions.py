@@ -13,7 +13,6 @@ from arm_companion.mission.motion import (
     Reference,
     add,
     clip_norm,
-    dot,
     follow,
     norm,
     ramp,
@@ -58,7 +57,6 @@ _WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})
 _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
-_NEAR_M = 0.15  # from here on the bar may be touched at any moment
 _FAR_FACTOR = 3.0
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
@@ -107,7 +105,7 @@ def _prepare(s: Situation) -> State:
                 tries=state.tries + 1,
             )
         case Phase.REACH:
-            force = replace(state.force, tared_s=0.0, above_s=0.0)
+            force = replace(state.force, tared_s=0.0, since_s=0.0, above_s=0.0)
             return replace(state, force=force, contact_w=s.place(0.0))
         case Phase.CONTACT:
             return replace(state, contact_w=_touching(s))
@@ -342,8 +340,7 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
         case Phase.CONTACT:
             return _clear_of_bar(s), perch.reach_speed_m_per_s
         case Phase.REACH:
-            short = dot(sub(s.place(0.0), s.facts.vehicle.position_w), s.ahead)
-            hurry = _FAR_FACTOR if short > _NEAR_M else 1.0
+            hurry = 1.0 if s.near_bar else _FAR_FACTOR
             return s.place(-perch.overreach_m), hurry * perch.reach_speed_m_per_s
         case Phase.VERIFY:
             return add(anchor, scale(s.ahead, -perch.verify_pull_m)), perch.verify_pull_m

@@ -12,9 +12,10 @@ from dataclasses import dataclass
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import TendonState, Vec3, VehicleState
 from arm_companion.mission.motion import add, norm, rotate, scale, sub
+from arm_companion.mission.payload import DRAG_PER_S
 from arm_companion.values import replace
 
-_POLE = 9.0  # rad/s, both poles of the observer
+_POLE = 14.0  # rad/s, both poles of the observer
 OBSERVER_LAG_S = 2.0 / _POLE
 _TARE_S = 1.0
 _TENSION_SMOOTHING_S = 0.15
@@ -29,13 +30,15 @@ Vec2 = tuple[float, float]
 class ForceObserver:
     """Horizontal force from outside on the vehicle, world axes (north, east).
 
-    A Luenberger observer of velocity and force with `m dv/dt = m g tan(tilt) + f`.
+    A Luenberger observer of velocity and force with `m dv/dt = m (g tan(tilt) - d v) + f`. Without the drag d the bias,
+    which is found in motion, would stay in the force of a vehicle that is held.
 
     Attributes:
         velocity: estimate (2,), m/s; None before the first state.
         force: estimate (2,), N, with whatever wind and level error put on top.
         bias: mean of `force` while the arm was certainly free (2,), N.
-        tared_s: time since that mean was begun, s; its first second is the mean's.
+        tared_s: length of that mean, s; a second is enough to go by.
+        since_s: time since its end, s.
         above_s: how long the residual has been above the threshold without a break, s.
     """
 
@@ -43,19 +46,25 @@ class ForceObserver:
     force: Vec2 = (0.0, 0.0)
     bias: Vec2 = (0.0, 0.0)
     tared_s: float = 0.0
+    since_s: float = 0.0
     above_s: float = 0.0
 
     @property
+    def tared(self) -> bool:
+        """Whether the bias is known."""
+        return self.tared_s >= _TARE_S
+
+    @property
     def residual(self) -> Vec2:
-        """Force beyond the bias (2,), N; zero until the bias is known."""
-        if self.tared_s < _TARE_S:
+        """Force beyond the bias (2,), N; zero until that is known."""
+        if not self.tared:
             return (0.0, 0.0)
         return (self.force[0] - self.bias[0], self.force[1] - self.bias[1])
 
     @property
     def bias_age_s(self) -> float:
         """For how long the wind may have changed since the bias was found, s; inf: it is not known."""
-        return self.tared_s - _TARE_S if self.tared_s >= _TARE_S else math.inf
+        return self.since_s if self.tared else math.inf
 
     def acceleration(self, vehicle: VehicleState, mass: float) -> Vec2:
         """Acceleration of the vehicle, m/s^2, north and east: what its tilt makes, and what is felt besides.
@@ -67,7 +76,8 @@ class ForceObserver:
         lean = _lean(vehicle)
         if lean is None or self.velocity is None:
             return (0.0, 0.0)
-        return (lean[0] + self.force[0] / mass, lean[1] + self.force[1] / mass)
+        drag = scale(vehicle.velocity_w, DRAG_PER_S)
+        return (lean[0] - drag[0] + self.force[0] / mass, lean[1] - drag[1] + self.force[1] / mass)
 
 
 def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: float) -> ForceObserver:
@@ -75,16 +85,16 @@ def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: fl
     v = (vehicle.velocity_w[0], vehicle.velocity_w[1])
     if old.velocity is None or dt <= 0.0:
         return replace(old, velocity=v)
-    tared_s = old.tared_s + dt if old.tared_s >= _TARE_S else old.tared_s
+    since_s = old.since_s + dt
     lean = _lean(vehicle)
     if lean is None:
-        return replace(old, velocity=v, tared_s=tared_s)
+        return replace(old, velocity=v, since_s=since_s)
     velocity, force = [], []
     for i in range(2):
         miss = v[i] - old.velocity[i]
-        velocity.append(old.velocity[i] + dt * (lean[i] + old.force[i] / mass + 2.0 * _POLE * miss))
+        velocity.append(old.velocity[i] + dt * (lean[i] - DRAG_PER_S * v[i] + old.force[i] / mass + 2.0 * _POLE * miss))
         force.append(old.force[i] + dt * mass * _POLE * _POLE * miss)
-    return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]), tared_s=tared_s)
+    return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]), since_s=since_s)
 
 
 def _lean(vehicle: VehicleState) -> Vec2 | None:
@@ -96,15 +106,15 @@ def _lean(vehicle: VehicleState) -> Vec2 | None:
 
 
 def tare(old: ForceObserver, dt: float) -> ForceObserver:
-    """Take the present force into the bias, as long as that is still being found."""
-    if old.tared_s >= _TARE_S or dt <= 0.0:
+    """Take the present force into the bias: the arm is certainly free, and the vehicle far from the bar."""
+    if dt <= 0.0:
         return old
     share = dt / (old.tared_s + dt)
     bias = (
         old.bias[0] + share * (old.force[0] - old.bias[0]),
         old.bias[1] + share * (old.force[1] - old.bias[1]),
     )
-    return replace(old, bias=bias, tared_s=old.tared_s + dt)
+    return replace(old, bias=bias, tared_s=old.tared_s + dt, since_s=0.0)
 
 
 def time_above(old: ForceObserver, direction: Vec2, threshold: float, dt: float) -> ForceObserver:

@@ -112,8 +112,9 @@ def _estimate(s: Situation) -> State:
         observe_force(state.force, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt) if s.vehicle_fresh else state.force
     )
     if state.phase is Phase.REACH and not s.gripping:
+        force = force if s.near_bar and force.tared else tare(force, s.dt)
         # the bar pushes the arm, and with it the vehicle, back
-        force = time_above(tare(force, s.dt), (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
+        force = time_above(force, (-s.ahead[0], -s.ahead[1]), perch.contact_force_n, s.dt)
     return replace(
         state,
         force=force,

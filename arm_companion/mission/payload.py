@@ -32,6 +32,9 @@ from arm_companion.mission.facts import VehicleState
 from arm_companion.mission.motion import rotate
 from arm_companion.values import replace
 
+DRAG_PER_S = 0.14
+"""Drag of rotors and airframe in slow flight, as an acceleration for each metre a second, before it is learnt."""
+
 ROTOR_LAG_S = 0.04
 """From the thrust that is told to the thrust, s: rotors of a foot take 30 ms, and it is told 50 times a second."""
 
@@ -42,7 +45,6 @@ _VIOLENT = 1.5  # m/s^2, beyond which the curve is no straight line
 _SPECTRUM = 1.5e-3  # m^2/s^3: an acceleration known to 0.05 m/s^2, with errors that last 0.3 s
 _DRIFT = 0.005  # m/s^2 per root second, of what the rotors lift at the same share, besides the battery's fall
 _PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line through zero
-_PRIOR_DRAG = 0.14  # 1/s
 _PRIOR_SIGMA = (1.0, 0.35, 0.1, 0.003)  # of a, m/s^2; the slope, in the same terms; the drag; a's fall, m/s^3
 _FALL_DRIFT = 1e-4  # m/s^3 per root second
 _LEAST_SHARE = 0.05  # rotors that idle say nothing
@@ -98,7 +100,7 @@ class ThrustCurve:
         """What is known of a hover at the share `at` before anything was measured."""
         slope = GRAVITY / at
         sigma = (_PRIOR_SIGMA[0], _PRIOR_SIGMA[1] * slope, *_PRIOR_SIGMA[2:])
-        theta = (GRAVITY, _PRIOR_SLOPE * slope, _PRIOR_DRAG, 0.0)
+        theta = (GRAVITY, _PRIOR_SLOPE * slope, DRAG_PER_S, 0.0)
         return cls(at, theta, _rows(np.diag(np.square(sigma))))
 
     @property

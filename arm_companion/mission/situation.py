@@ -19,6 +19,7 @@ from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.values import replace
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
+_NEAR_M = 0.15
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
 
 
@@ -283,6 +284,11 @@ class Situation:
         base = sub(bar.point_w, scale(self.ahead, back))
         base = sub(base, scale(self.straight_w, perch.contact_arc_m))
         return sub(base, self.base_offset_w(self.state.heading))
+
+    @property
+    def near_bar(self) -> bool:
+        """Whether the arm of a vehicle on its way from the stand-off may touch the bar at any moment."""
+        return dot(sub(self.place(0.0), self.facts.vehicle.position_w), self.ahead) <= _NEAR_M
 
     @property
     def standoff(self) -> Vec3:

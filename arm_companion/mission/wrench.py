@@ -35,7 +35,7 @@ _HELD_TENSION_SIGMA = 1.0  # N, on top of it
 _LEAST_HZ = 5.0
 _RETRY_S = 0.25
 # the vehicle's position since the grip is known to a few millimetres, and a wrap rolls by as much before it holds
-_FELT_SIGMA = (0.3, 0.3, 1.5)  # N, world axes; down, where the thrust is not known
+_FELT_SIGMA = (0.1, 0.1, 1.5)  # N, world axes; down, where the thrust is not known
 _WIND_SIGMA = 1.0  # N, by which the wind's force on a hovering vehicle wanders about its mean
 _WIND_S = 30.0  # and how long it remembers
 _SLIDE_SIGMA = (0.0, 0.0, 10.0)  # N, world axes: by how much the elastic model is off where the wrap slides

@@ -1,7 +1,8 @@
 """Motion capture: tells a real flight stack where the vehicle is, as in a laboratory, by VISION_POSITION_ESTIMATE.
 
-Its position has the error that the stand-in's estimate has (`estimator`). Satellites and a barometer are not good
-enough for a perch: their estimate wanders by centimetres within seconds (docs/results.md).
+Its position has an error of the size that the stand-in's estimate has (`estimator`), and jumps about with it.
+Satellites and a barometer are not good enough for a perch: their estimate wanders by centimetres within seconds
+(docs/results.md).
 """
 
 import math
@@ -27,7 +28,8 @@ class Capture:
     """
 
     def __init__(self, seed: int, noise_m: float) -> None:
-        self._estimator = Estimator(random.Random(seed), noise_m)  # noqa: S311 - a simulation, repeatable by design
+        rng = random.Random(seed)  # noqa: S311 - a simulation, repeatable by design
+        self._estimator = Estimator(rng, noise_m, inertial=False)
         self._since = 0.0
 
     def message(self, state: RigidState, t: float, dt: float) -> Any | None:

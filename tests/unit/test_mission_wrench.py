@@ -157,12 +157,13 @@ def test_the_longer_ago_the_tare_the_less_sure_is_the_force_of_a_held_arm_and_no
     facts = hovering(BENT)
     state = moving(parameters, facts)
     told = []
-    for seconds in (1.0, 11.0, 601.0, 0.0):
-        force = ForceObserver(velocity=(0.0, 0.0), tared_s=seconds)
+    for seconds in (0.0, 10.0, 600.0, math.inf):
+        tared = {"tared_s": 1.0, "since_s": seconds} if math.isfinite(seconds) else {}
+        force = ForceObserver(velocity=(0.0, 0.0), **tared)
         _, said = run(dataclasses.replace(state, offset=(0.0, 0.0, 0.0), force=force), facts, parameters)
         told.append(said[0].wrench)
     fresh, later, old, never = told
-    assert fresh.force_sigma[0] < 0.31
+    assert fresh.force_sigma[0] < 0.11
     assert 0.6 < later.force_sigma[0] < old.force_sigma[0]
     assert 1.3 < old.force_sigma[0] < 1.5, "a wind of 3 N that came after the grip is within two of them"
     assert never.force_sigma == pytest.approx(old.force_sigma, rel=0.01)
