@@ -241,6 +241,8 @@ class MavlinkCodec:
             if (end < len(data) and data[end] not in MAGICS) or self._hides_frame(data, head.magic + 1, end):
                 return False
             counters.unknown += 1
+            if (sender := head.system << 8 | head.component) in self._sequences:
+                self._count_losses(sender, head.sequence)  # it came: its number is not missing
             return True
         if not _checksum_fits(data, head, layout):
             counters.bad_crc += 1

@@ -46,23 +46,27 @@ class SerialPort:
         self._receiver = receiver
         self._waiting: deque[bytes] = deque()
         self._waiting_bytes = 0
+        self._begun = False  # the first of what waits is the rest of a chunk: half of it has been sent
         self._gone = asyncio.Event()
         self._loop = asyncio.get_running_loop()
         self._loop.add_reader(self._descriptor, self._read)
 
     def write(self, data: bytes) -> None:
-        """Send `data`; of what has to wait, the oldest is dropped when it is too much."""
+        """Send `data`; of what has to wait, the oldest is dropped when it is too much, but never half a chunk."""
         if self._gone.is_set() or not data:
             return
         if not self._waiting:
-            data = data[self._send(data) :]
-            if not data or self._gone.is_set():
+            sent = self._send(data)
+            if sent == len(data) or self._gone.is_set():
                 return
+            self._begun, data = sent > 0, data[sent:]
             self._loop.add_writer(self._descriptor, self._write_waiting)
         self._waiting.append(data)
         self._waiting_bytes += len(data)
-        while self._waiting_bytes > BACKLOG_BYTES and len(self._waiting) > 1:
-            self._waiting_bytes -= len(self._waiting.popleft())
+        while self._waiting_bytes > BACKLOG_BYTES and len(self._waiting) > 1 + self._begun:
+            # half a frame would spoil the one behind it, too
+            self._waiting_bytes -= len(self._waiting[self._begun])
+            del self._waiting[self._begun]
             self.dropped += 1
 
     def close(self) -> None:
@@ -110,9 +114,11 @@ class SerialPort:
             if self._gone.is_set():
                 return
             if sent < len(self._waiting[0]):
+                self._begun |= sent > 0
                 self._waiting[0] = self._waiting[0][sent:]
                 return
             self._waiting.popleft()
+            self._begun = False
         self._loop.remove_writer(self._descriptor)
 
     def _lose(self, why: object) -> None:

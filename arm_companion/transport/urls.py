@@ -38,7 +38,12 @@ def open_url(url: str) -> Opener:
         raise ConfigError(f"link url {url!r} is not one of {FORMS}")
     if not 1 <= value <= 65_535:
         raise ConfigError(f"link url {url!r}: port {value} is outside 1 to 65535")
-    return _SOCKETS[scheme](place.removeprefix("[").removesuffix("]"), value)
+    host = place.removeprefix("[").removesuffix("]")
+    try:
+        host.encode("idna")  # as the socket will, whose UnicodeError would be nobody's
+    except UnicodeError:
+        raise ConfigError(f"link url {url!r}: {host!r} is no name of a host") from None
+    return _SOCKETS[scheme](host, value)
 
 
 def open_bus(port: str, baud: int) -> Opener:

@@ -130,6 +130,17 @@ def test_missing_frames_are_counted_for_each_sender() -> None:
     assert reader.counters.lost == 3
 
 
+def test_frames_with_ids_that_the_dialect_lacks_are_not_missing() -> None:
+    """An ArduPilot sends many of its own: a line that loses nothing must not be said to."""
+    sender, reader = MavlinkCodec(1, 1), MavlinkCodec(1, 192)
+    frames = [bytearray(sender.encode(heartbeat())) for _ in range(300)]
+    for frame in frames[1::2]:
+        frame[7:10] = b"\x11\xee\x00"
+    del frames[100:104]
+    reader.feed(b"".join(frames))
+    assert (reader.counters.unknown, reader.counters.lost) == (148, 4)
+
+
 def unknown_frame(length: int = 9) -> bytes:
     return bytes([MAGIC_V2, length, 0, 0, 0, 1, 1, 0x39, 0x30, 0x00]) + bytes(length + 2)
 

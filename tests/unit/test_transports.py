@@ -315,6 +315,7 @@ def test_a_memory_pipe_delivers_what_is_written_at_one_instant_in_order_and_at_o
         "udpout:[::1]:14550",
         "tcp:[::1]:5760",
         "tcpin:0.0.0.0:5760",
+        "tcp:[fe80::1%eth0]:5760",
         "serial:/dev/ttyAMA0:921600",
     ],
 )
@@ -338,6 +339,8 @@ def test_good_urls_name_an_opener(url: str) -> None:
         ("tcp:127.0.0.1", "is not one of"),
         ("tcpin:0.0.0.0:0", "port 0 is outside"),
         ("tcpout:127.0.0.1:5760", "is not one of"),
+        ("udpout:192.168..1:14550", "'192.168..1' is no name of a host"),
+        (f"tcp:{'a' * 64}:5760", "is no name of a host"),
     ],
 )
 def test_bad_urls_are_refused_with_the_forms_that_are_allowed(url: str, reason: str) -> None:
