@@ -45,7 +45,8 @@ class Sender:
 def sender_of(message: Message, link: MavlinkLink) -> Sender:
     """Who sent a message that came in on `link`."""
     system = message.get_srcSystem()
-    return Sender(system, message.get_srcComponent(), link.role, system == link.system_id, link.trusts(message))
+    trusted = link.trusts(signed=message.get_signed())
+    return Sender(system, message.get_srcComponent(), link.role, system == link.system_id, trusted)
 
 
 class Access:

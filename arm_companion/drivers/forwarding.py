@@ -2,7 +2,8 @@
 
 A frame for everybody goes to every other link; one for a component goes where that component has been heard; one
 for all components of a system where any of them has been heard. A frame never goes back where it came from, what is
-for us alone goes nowhere, and SETUP_SIGNING, which carries a key, never leaves the link that it came on.
+for us alone goes nowhere, and SETUP_SIGNING, which carries a key, never leaves the link that it came on. An unsigned
+one that may only tell us something (`unsigned = "listen"`) may tell the ground, and asks nothing of anybody else.
 """
 
 from collections.abc import Sequence
@@ -11,7 +12,7 @@ from typing import Final
 
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import Header, addressee
+from arm_companion.protocol.mavlink import SIGNED, Header, addressee
 
 MOST_ROUTES: Final = 256
 """Components that are remembered on each link."""
@@ -57,6 +58,9 @@ class Forwarding:
         if target == (source.system_id, source.component_id) or head.id == mav.MAVLINK_MSG_ID_SETUP_SIGNING:
             return
         ways = [link for link in self._links if link is not source and self._reaches(link, target)]
+        if not source.trusts(signed=bool(head.flags & SIGNED)):
+            # it may tell people something, but not ask the autopilot, or a peer, through us
+            ways = [link for link in ways if link.role == "ground"]
         if not ways:
             self.counters.unrouted += 1
         for link in ways:

@@ -204,9 +204,9 @@ class MavlinkLink:
         """Key and time stamps; None where nothing is signed."""
         return self._signing
 
-    def trusts(self, message: Message) -> bool:
-        """Whether the message's sender may ask for something: it is signed, or need not be."""
-        return self._signing is None or self.config.unsigned == "accept" or bool(message.get_signed())
+    def trusts(self, *, signed: bool) -> bool:
+        """Whether the sender of a frame that was let in may ask for something: it is signed, or need not be."""
+        return self._signing is None or self.config.unsigned == "accept" or signed
 
     # --- in and out ---
 

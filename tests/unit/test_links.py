@@ -502,6 +502,29 @@ def test_what_a_signing_link_refuses_is_not_forwarded() -> None:
     route(body)
 
 
+@pytest.mark.parametrize(("unsigned", "arrives"), [("listen", False), ("accept", True)])
+def test_who_may_only_tell_asks_nothing_of_the_autopilot_through_us(unsigned: str, arrives: bool) -> None:
+    async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], _: Forwarding) -> None:
+        links[0].config = dataclasses.replace(links[0].config, unsigned=unsigned)
+        links[1].role = "autopilot"
+        links[0].secure(Signing(KEY), lambda: SIMULATED_EPOCH_S)
+        for peer in peers[1:]:
+            peer.send(GCS)
+        arm = mav.MAVLink_command_long_message(12, 1, mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 0, 21196, 0, 0, 0, 0, 0)
+        await asyncio.sleep(0.1)
+        peers[0].send(GCS, arm)
+        await asyncio.sleep(0.1)
+        assert bool(peers[1].all("COMMAND_LONG")) is arrives
+        assert bool(senders(peers[1], "HEARTBEAT").count(11)) is arrives
+        assert senders(peers[2], "HEARTBEAT") == [12, 11], "the ground is told"
+        sealed(peers[0])
+        peers[0].send(arm)
+        await asyncio.sleep(0.1)
+        assert peers[1].all("COMMAND_LONG")
+
+    route(body)
+
+
 def test_a_flood_on_one_link_delays_no_other() -> None:
     async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], _: Forwarding) -> None:
         arrivals: list[float] = []
