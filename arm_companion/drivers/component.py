@@ -22,6 +22,7 @@ from arm_companion.drivers.settings import Settings
 from arm_companion.drivers.standard_services import Power, StandardServices
 from arm_companion.drivers.status_text import Speaker
 from arm_companion.drivers.system_status import SystemStatus
+from arm_companion.drivers.timesync import addressee
 from arm_companion.mission.facts import Answer, Bar, Notice, Request
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.ftp import crc32
@@ -254,6 +255,9 @@ class Component:
 
     def _on_timesync(self, message: Message, link: MavlinkLink) -> None:
         """A question has no time of the other side yet; an answer is the autopilot driver's."""
+        system, component = addressee(message)
+        if system not in (0, link.system_id) or component not in (0, link.component_id):
+            return  # who asks the autopilot must not take our time for its
         if message.tc1 == 0 and not self._is_self(message, link):
             now = round(self._clock.now() * 1e9)
             link.send(mav.MAVLink_timesync_message(now, message.ts1), Priority.NOW)  # waiting would spoil it

@@ -14,7 +14,7 @@ from arm_companion.drivers.access import sender_of
 from arm_companion.drivers.flight_stack import AUTOPILOT_COMPONENT
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import Message
+from arm_companion.protocol.mavlink import MAGIC_V2, Message
 
 PERIOD_S: Final = 0.5
 WINDOW: Final = 20
@@ -24,6 +24,9 @@ DRIFT: Final = 100e-6
 """Greatest rate at which two clocks go apart: twice 50 ppm."""
 
 _LONGEST_TRIP_S: Final = 0.5
+_ADDRESS: Final = 10 + 16
+"""Where a MAVLink 2 frame has target_system and target_component, if it has them: behind header and time stamps."""
+
 _NS: Final = 1e-9
 
 
@@ -42,6 +45,18 @@ class TimesyncCounters:
     answered: int = 0  # answers to what we asked
     strange: int = 0  # answers to what we did not ask, or that took too long
     jumps: int = 0  # times that the other clock was another one all of a sudden
+
+
+def addressee(message: Message) -> tuple[int, int]:
+    """System and component that a TIMESYNC is for; zeros are everybody.
+
+    Newer definitions have them as extensions, which the generated message lacks.
+    """
+    frame = message.get_msgbuf()
+    if frame[0] != MAGIC_V2:
+        return 0, 0
+    system, component = frame[_ADDRESS : 10 + frame[1]][:2].ljust(2, b"\0")
+    return system, component
 
 
 class Timesync:

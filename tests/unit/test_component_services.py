@@ -2,6 +2,7 @@
 
 import asyncio
 import math
+import struct
 from typing import Any
 
 import pytest
@@ -9,7 +10,7 @@ import pytest
 from arm_companion.drivers.standard_services import Power
 from arm_companion.mission.facts import Answer, Notice, Order, Result, Severity
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.mavlink import MavlinkCodec, checksum
 from arm_companion.protocol.tunnel import tunnel
 from tests.conftest import MavlinkPeer
 from tests.unit.component_rig import GCS, ServiceRig, serve
@@ -363,6 +364,24 @@ def test_a_question_for_the_time_is_answered() -> None:
         (answer,) = rig.ground.all("TIMESYNC")
         assert answer.ts1 == 123_456
         assert answer.tc1 == pytest.approx(asyncio.get_running_loop().time() * 1e9, abs=0.1e9)
+
+    serve(body)
+
+
+@pytest.mark.parametrize(
+    ("target", "answers"), [((1, 1), 0), ((1, 0), 1), ((1, 192), 1), ((2, 192), 0), ((0, 192), 1), ((0, 1), 0)]
+)
+def test_a_question_for_the_time_of_another_component_is_not_ours_to_answer(
+    target: tuple[int, int], answers: int
+) -> None:
+    """Newer peers put the address behind the fields that pymavlink knows."""
+
+    async def body(rig: ServiceRig) -> None:
+        payload = struct.pack("<qqBB", 0, 123_456, *target).rstrip(b"\0")
+        frame = bytes((0xFD, len(payload), 0, 0, 0, 255, 190, mav.MAVLINK_MSG_ID_TIMESYNC, 0, 0)) + payload
+        rig.ground.send_raw(frame + checksum(frame, 34).to_bytes(2, "little"))
+        await soon()
+        assert [m.ts1 for m in rig.ground.all("TIMESYNC")] == [123_456] * answers
 
     serve(body)
 
