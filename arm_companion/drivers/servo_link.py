@@ -5,6 +5,7 @@ of `servo_bus`.
 """
 
 import asyncio
+import math
 from collections.abc import Sequence
 
 from arm_companion.errors import DeviceFault, ProtocolError
@@ -126,7 +127,14 @@ class ServoLink:
         self._finish()
 
     async def ask(
-        self, request: bytes, servos: Sequence[int], size: int, deadline: float, *, fast: bool = False
+        self,
+        request: bytes,
+        servos: Sequence[int],
+        size: int,
+        deadline: float,
+        *,
+        fast: bool = False,
+        sure: bool = False,
     ) -> dict[int, Packet]:
         """Send `request`; answers by servo id, without those that did not come in time.
 
@@ -136,6 +144,7 @@ class ServoLink:
             size: bytes of data in each answer.
             deadline: loop time at which to stop waiting whatever the wire would still allow.
             fast: the request is a Fast Sync Read, which all servos answer in one frame.
+            sure: ask nothing while the answer to an earlier request may still come, which would pass for this one's.
         """
         async with self._lock:
             loop = asyncio.get_running_loop()
@@ -145,6 +154,8 @@ class ServoLink:
             for servo in servos:
                 wire += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
             if self._transport is None or not servos or wire > deadline:
+                return {}
+            if sure and any(self._owes(servo) for servo in servos):
                 return {}
             self.parser.reset()
             self._wanted, self._size, self._fast, self._answers = servos, size, fast, {}
@@ -159,9 +170,10 @@ class ServoLink:
             end = loop.time()
             self._line_free_at = min(wire, end)
             if len(self._answers) == len(servos):
-                if not self._owed:
+                if self._owed.keys().isdisjoint(servos):
                     self.latency.learn(max(end - wire, 0.0))
-                self._owed.clear()
+                for servo in servos:
+                    self._owed.pop(servo, None)
             else:
                 self._owed |= {servo: wire for servo in servos if servo not in self._answers}
             return self._answers
@@ -176,16 +188,17 @@ class ServoLink:
     async def command(self, servo: int, request: bytes, size: int = 0, tries: int = _TRIES) -> bytes:
         """Data of one servo's answer; asks again when none comes.
 
-        Answers carry no number: before it asks again, a late one is given time to come and be dropped.
+        Answers carry neither number nor address: before it asks for data, or asks again, a late one is given time to
+        come and be dropped.
 
         Raises:
             DeviceFault: when it stays silent, or refuses.
         """
         for attempt in range(tries):
-            if attempt:
+            if attempt or (size and self._owes(servo)):
                 await asyncio.sleep(DRAIN_S)
             deadline = asyncio.get_running_loop().time() + self.timeout_s
-            answers = await self.ask(request, (servo,), size, deadline)
+            answers = await self.ask(request, (servo,), size, deadline, sure=size > 0)
             if servo in answers:
                 refusal = answers[servo].error & ~dxl.ALERT
                 if refusal:
@@ -216,6 +229,10 @@ class ServoLink:
             await self.command(servo, dxl.write(servo, register.address, register.encode(value)), tries=tries)
         except DeviceFault as fault:
             raise DeviceFault(servo, 0, f"{register.name} = {value}: {fault}") from fault
+
+    def _owes(self, servo: int) -> bool:
+        """Whether the answer to an earlier request may still come."""
+        return asyncio.get_running_loop().time() - self._owed.get(servo, -math.inf) < DRAIN_S
 
     def _learn_from_late(self, servo: int) -> None:
         due = self._owed.pop(servo, None)

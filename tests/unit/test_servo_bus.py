@@ -8,7 +8,7 @@ import random
 import socket
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -16,6 +16,7 @@ from arm_companion.clock import precise_loop, run_simulated, ticks
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_health import ServoState
+from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.errors import DeviceFault, LinkError
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
@@ -496,6 +497,36 @@ def test_a_slow_adapter_still_finds_servos_again_after_a_gap() -> None:
         assert all(s.ready and not s.silent for s in states)
 
     scenario(story)
+
+
+class LateServo:
+    """A servo whose answers take a while: of its watchdog longer than anybody waits. Registers hold their address."""
+
+    def __init__(self, link: ServoLink) -> None:
+        self.link = link
+
+    def write(self, data: bytes) -> None:
+        (request,) = dxl.Parser().feed(data)
+        address = request.parameters[0]
+        late = 0.0016 if address == ct.BUS_WATCHDOG.address else 0.0003
+        asyncio.get_running_loop().call_later(late, self.link.receive, dxl.status(2, 0, bytes((address,))))
+
+
+def test_the_late_answer_to_another_question_is_not_believed() -> None:
+    """The cycle looks at a watchdog while a servo is set up, whose next question is whether its turns are known."""
+
+    async def main() -> None:
+        link = ServoLink(1_000_000, 0.008)
+        link.attach(cast("Transport", LateServo(link)))
+        audit = dxl.sync_read((2,), ct.BUS_WATCHDOG.address, 1)
+        for _ in range(3):
+            asking = asyncio.create_task(link.ask(audit, (2,), 1, asyncio.get_running_loop().time() + 0.001))
+            await asyncio.sleep(0)
+            assert await link.read(2, ct.LED) == ct.LED.address
+            assert not await asking
+            assert await link.read(2, ct.TORQUE_ENABLE) == ct.TORQUE_ENABLE.address
+
+    run_simulated(main())
 
 
 def test_an_adapter_at_its_factory_latency_is_named_as_the_trouble() -> None:
