@@ -18,7 +18,7 @@ from arm_companion.drivers.keeper import Keeper
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.drivers.settings import state_directory
 from arm_companion.errors import ConfigError
-from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing, stamp_at
+from arm_companion.protocol.signing import KEY_LENGTH, UNITS_PER_S, Signing, Streams, stamp_at
 
 log = logging.getLogger(__name__)
 
@@ -71,6 +71,7 @@ class SigningKeys:
         self._kept: dict[Path, Signing] = {}
         self._last: dict[Path, int] = {}  # stamps at the last writing
         self._by_link: dict[str, Signing] = {}
+        heard: dict[bytes, Streams] = {}
         for number, (name, link) in enumerate(config.links.items()):
             if not link.signing_key:
                 continue
@@ -79,7 +80,8 @@ class SigningKeys:
                 log.warning("link %s: signing time stamps are not kept: set mavlink.state_directory", name)
             else:
                 stamp = _read_stamp(self._directory / f"signing-{name}")
-            signing = Signing(read_key(Path(link.signing_key)), number, stamp)
+            key = read_key(Path(link.signing_key))
+            signing = Signing(key, number, stamp, heard.setdefault(key, {}))
             self._by_link[name] = signing
             if self._directory is not None:
                 file = self._directory / f"signing-{name}"

@@ -31,6 +31,10 @@ def stamp_at(unix_s: float) -> int:
     return min(max(int((unix_s - EPOCH_S) * UNITS_PER_S), 0), _STAMP_MAX)
 
 
+Streams = dict[tuple[int, int, int], int]
+"""Newest time stamp by system, component and the sender's link id."""
+
+
 class Signing:
     """Key, time stamp and what was heard on one link.
 
@@ -38,19 +42,20 @@ class Signing:
         key: 32 bytes, shared by all who may speak.
         link_id: number of the link in what we sign.
         stamp: time stamp to start from, as kept since the last run; 0: none.
+        streams: what was heard by all who share it. Links with one key do: a frame counts once, on whichever it comes.
 
     Raises:
         ProtocolError: the key has another length.
     """
 
-    def __init__(self, key: bytes, link_id: int = 0, stamp: int = 0) -> None:
+    def __init__(self, key: bytes, link_id: int = 0, stamp: int = 0, streams: Streams | None = None) -> None:
         if len(key) != KEY_LENGTH:
             raise ProtocolError(f"a signing key has {KEY_LENGTH} bytes, not {len(key)}")
         self.stamp = stamp
         """Newest time stamp, ours or accepted: what has to be kept over a restart."""
         self._key = key
         self._link_id = link_id & 0xFF
-        self._streams: dict[tuple[int, int, int], int] = {}
+        self._streams: Streams = {} if streams is None else streams
 
     def sign(self, frame: bytes, unix_s: float) -> bytes:
         """The frame with its signature.

@@ -368,6 +368,24 @@ def test_restarts_in_a_row_lock_no_ground_station_out(tmp_path: Path, seconds: i
     run_simulated(main())
 
 
+def test_a_frame_counts_once_on_whichever_of_the_links_with_its_key_it_comes(tmp_path: Path) -> None:
+    config = signing_config(tmp_path)
+    other = tmp_path / "other"
+    other.write_bytes(bytes(32))
+    other.chmod(0o600)
+    ground = config.links["ground"]
+    links = {"ground": ground, "radio": ground, "else": dataclasses.replace(ground, signing_key=str(other))}
+    keys = SigningKeys(dataclasses.replace(config, links=links), Keeper())
+    sender, codec, head = Signing(KEY, 3), MavlinkCodec(255, 190), Header(1, 0, 255, 190, 0, 0, 10, 19)
+    old, new = (sender.sign(codec.encode(GCS), SIMULATED_EPOCH_S) for _ in range(2))
+    assert keys._by_link["ground"].accept(old, head, SIMULATED_EPOCH_S)
+    assert not keys._by_link["radio"].accept(old, head, SIMULATED_EPOCH_S + 30.0), "played back"
+    assert keys._by_link["radio"].accept(new, head, SIMULATED_EPOCH_S)
+    assert not keys._by_link["else"].accept(new, head, SIMULATED_EPOCH_S)
+    stranger = Signing(bytes(32), 3).sign(codec.encode(GCS), SIMULATED_EPOCH_S)
+    assert keys._by_link["else"].accept(stranger, head, SIMULATED_EPOCH_S), "another key has other senders"
+
+
 def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) -> None:
     config = signing_config(tmp_path)
     later = stamp_at(SIMULATED_EPOCH_S + 1e6)
