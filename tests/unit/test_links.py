@@ -410,6 +410,40 @@ def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) ->
     asyncio.run(main())
 
 
+# --- half a frame ---
+
+
+@pytest.mark.parametrize(
+    ("url", "pause_s", "arrives"),
+    [
+        ("tcp:ground:5760", 0.3, True),
+        ("tcpin:0.0.0.0:5760", 0.3, True),
+        ("tcp:ground:5760", 1.1, False),
+        ("", 0.3, False),
+    ],
+)
+def test_the_second_half_of_a_frame_is_waited_for_as_long_as_its_way_may_pause(
+    url: str, pause_s: float, arrives: bool
+) -> None:
+    async def main() -> None:
+        peer = MavlinkPeer(255, 190)
+        await peer.open()
+        link = MavlinkLink("ground", "ground", peer.pipe.opener(0), VEHICLE, config=LinkConfig(url))
+        heard: list[str] = []
+        link.subscribe(lambda message, _: heard.append(message.get_type()))
+        running = asyncio.create_task(link.run())
+        await asyncio.sleep(0.1)
+        frame = peer.codec.encode(ping(1, (1, 192)))
+        peer.send_raw(frame[:9])
+        await asyncio.sleep(pause_s)
+        peer.send_raw(frame[9:])
+        await asyncio.sleep(0.1)
+        assert heard == ["PING"] * arrives
+        running.cancel()
+
+    run_simulated(main())
+
+
 # --- forwarding ---
 
 
