@@ -254,6 +254,8 @@ class Daemon:
         for text in self._recorder.troubles():
             log.warning("%s", text)
             self._component.notify(Notice(Severity.WARNING, text))
+        for text in self._keeper.troubles():  # what the ground has set counts now, and would not after a restart
+            self._component.notify(Notice(Severity.WARNING, text))
 
     async def _observe(self) -> Facts:
         every = await self._bus.read()

@@ -3,6 +3,7 @@
 import contextlib
 import logging
 import os
+from collections import deque
 from pathlib import Path
 from typing import Final
 
@@ -18,12 +19,18 @@ class Keeper:
 
     def __init__(self) -> None:
         self._newest: dict[Path, bytes] = {}  # only the thread takes out of it
+        self._unkept: set[Path] = set()
+        self._troubles: deque[str] = deque()
         self._writer = Writer("keeper")
 
     def put(self, file: Path, data: bytes) -> None:
-        """Write `data` to `file` soon; an error is logged, and the old file is left."""
+        """Write `data` to `file` soon; an error is logged and told, and the old file is left."""
         self._newest[file] = data
         self._writer.submit(self._write)
+
+    def troubles(self) -> list[str]:
+        """What people should know: of each file once that it is not kept, until it is."""
+        return [self._troubles.popleft() for _ in range(len(self._troubles))]
 
     def close(self) -> None:
         """Write what is left and stop; give up on a disk that hangs."""
@@ -36,6 +43,11 @@ class Keeper:
                 write_atomically(file, data)
             except OSError as error:
                 log.error("%s is not kept: %s", file, error)  # noqa: TRY400 - the error says it all
+                if file not in self._unkept:
+                    self._troubles.append(f"{file.name} is not kept: {error.strerror or error}")
+                self._unkept.add(file)
+            else:
+                self._unkept.discard(file)
 
 
 def write_atomically(file: Path, data: bytes) -> None:

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import json
 import math
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -82,6 +83,23 @@ def test_parameters_change_the_daemon_and_survive_a_restart_that_the_ground_asks
         kept = json.loads((tmp_path / FILE).read_text())
         assert kept == {"limits.bend_max_rad": 5.0, "perch.standoff_m": 0.75, "rates.wrench_hz": 5.0}
         assert with_kept_changes(config(tmp_path)).perch.standoff_m == 0.75
+
+    run_simulated(main())
+
+
+def test_a_parameter_that_would_not_survive_a_restart_is_told(tmp_path: Path) -> None:
+    (tmp_path / "full").write_text("no folder")
+
+    async def main() -> None:
+        async with running(config(tmp_path / "full")) as (daemon, _, ground, _, _task):
+            for value in (5.0, 5.1):
+                ground.send(mav.MAVLink_param_set_message(1, 192, b"LIM_BEND", value, mav.MAV_PARAM_TYPE_REAL32))
+                await asyncio.sleep(0.05)
+                time.sleep(0.1)  # noqa: ASYNC251 - the thread that writes knows no simulated time
+                await asyncio.sleep(0.05)
+            assert daemon._parameters.config.limits.bend_max_rad == 5.1
+            told = [m.text for m in ground.all("STATUSTEXT") if "is not kept" in m.text]
+            assert told == ["parameters.json is not kept: File exists"], "once"
 
     run_simulated(main())
 

@@ -325,4 +325,6 @@ def test_a_disk_that_does_not_take_it_is_told(tmp_path: Path, caplog: pytest.Log
     keeper.put(tmp_path / FILE, b"new")
     keeper.close()
     assert "is not kept" in caplog.text
+    assert keeper.troubles() == ["parameters.json is not kept: File exists"]
+    assert keeper.troubles() == []
     assert (tmp_path / FILE).read_bytes() == b"new"
