@@ -2,8 +2,9 @@
 
 A frame for everybody goes to every other link; one for a component goes where that component has been heard; one
 for all components of a system where any of them has been heard. A frame never goes back where it came from, what is
-for us alone goes nowhere, and SETUP_SIGNING, which carries a key, never leaves the link that it came on. An unsigned
-one that may only tell us something (`unsigned = "listen"`) may tell the ground, and asks nothing of anybody else.
+for us alone goes nowhere. SETUP_SIGNING, which carries a key, never leaves the link that it came on, and neither does
+what a telemetry radio reports of itself: an autopilot takes it for the state of its own line, and sends less there. An
+unsigned one that may only tell (`unsigned = "listen"`) may tell the ground, and asks nothing of anybody else.
 """
 
 from collections.abc import Sequence
@@ -16,6 +17,9 @@ from arm_companion.protocol.mavlink import SIGNED, Header, addressee
 
 MOST_ROUTES: Final = 256
 """Components that are remembered on each link."""
+
+_RADIO: Final = 166  # of older radios; our dialect lacks it
+_STAYS: Final = frozenset({mav.MAVLINK_MSG_ID_SETUP_SIGNING, mav.MAVLINK_MSG_ID_RADIO_STATUS, _RADIO})
 
 
 @dataclass(slots=True)
@@ -55,7 +59,7 @@ class Forwarding:
         if len(heard) > MOST_ROUTES:
             del heard[next(iter(heard))]
         target = addressee(frame, head)
-        if target == (source.system_id, source.component_id) or head.id == mav.MAVLINK_MSG_ID_SETUP_SIGNING:
+        if target == (source.system_id, source.component_id) or head.id in _STAYS:
             return
         ways = [link for link in self._links if link is not source and self._reaches(link, target)]
         if not source.trusts(signed=bool(head.flags & SIGNED)):

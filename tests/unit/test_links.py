@@ -540,6 +540,19 @@ def test_links_that_do_not_forward_and_keys_and_echoes_stay_out() -> None:
     route(body, forward="ab")
 
 
+def test_what_a_radio_says_of_itself_is_not_forwarded() -> None:
+    async def body(_: Any, peers: list[MavlinkPeer], forwarding: Forwarding) -> None:
+        report = bytearray(peers[0].codec.encode(mav.MAVLink_radio_status_message(180, 180, 5, 40, 40, 0, 0)))
+        peers[0].send_raw(bytes(report))
+        report[7] = 166  # RADIO, as older ones call it
+        peers[0].send_raw(bytes(report))
+        await asyncio.sleep(0.1)
+        assert [(peer.received, peer.codec.counters.unknown) for peer in peers] == [([], 0)] * 3
+        assert forwarding.counters.frames == 0
+
+    route(body)
+
+
 def test_what_a_signing_link_refuses_is_not_forwarded() -> None:
     async def body(links: list[MavlinkLink], peers: list[MavlinkPeer], _: Forwarding) -> None:
         links[0].secure(Signing(KEY), lambda: SIMULATED_EPOCH_S)
