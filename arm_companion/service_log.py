@@ -4,9 +4,12 @@ systemd takes a line that begins with `<N>` as one of syslog's priority N (sd-da
 says has the same one, and `journalctl -p warning` is empty.
 """
 
+import contextlib
 import logging
 import os
 import sys
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Final, TextIO
 
 _FORMAT: Final = "%(levelname)s %(name)s: %(message)s"
@@ -43,3 +46,24 @@ def log_to_stderr(*, verbose: bool) -> None:
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter((JournalFormatter if read_by_journald(sys.stderr) else logging.Formatter)(_FORMAT))
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler])
+
+
+@contextlib.contextmanager
+def logging_to(path: Path) -> Iterator[None]:
+    """Send the program's log to a file for a while: a daemon within a process that has a terminal for other things.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter(_FORMAT))
+    log = logging.getLogger("arm_companion")
+    level = log.level
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        log.setLevel(level)
+        log.removeHandler(handler)
+        handler.close()

@@ -96,17 +96,8 @@ def _count(text: str) -> int:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fly the scenario; exit code 0 only when it did what it is for."""
-    if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
-        print(
-            "arm-companion sim: --trials needs --simulated and a scenario with a script",
-            file=sys.stderr,
-        )
-        return 2
-    if arguments.live is not None and arguments.simulated:
-        print("arm-companion sim: --live shows real time: leave out --simulated", file=sys.stderr)
-        return 2
-    if arguments.video is not None and (why := _no_video(arguments)):
-        print(f"arm-companion sim: --video {why}", file=sys.stderr)
+    if why := _wrong_usage(arguments):
+        print(f"arm-companion sim: {why}", file=sys.stderr)
         return 2
     arguments.config = arguments.config or _CONFIGS[arguments.scenario]
     for name in ("matplotlib", "mcap", "mujoco", "orjson", "rich"):
@@ -135,6 +126,19 @@ def _make_folder(output: Path) -> None:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ConfigError(f"--output {output}: {error.strerror}") from error
+
+
+def _wrong_usage(arguments: argparse.Namespace) -> str:
+    """What is wrong with options that argparse cannot judge, empty when nothing is."""
+    if arguments.trials is not None and not (arguments.simulated and arguments.scenario != "world"):
+        return "--trials needs --simulated and a scenario with a script"
+    if arguments.scenario == "world" and arguments.simulated:
+        return "world waits for people, in real time: leave out --simulated"
+    if arguments.live is not None and arguments.simulated:
+        return "--live shows real time: leave out --simulated"
+    if arguments.video is not None and (why := _no_video(arguments)):
+        return f"--video {why}"
+    return ""
 
 
 def _no_video(arguments: argparse.Namespace) -> str:
@@ -300,11 +304,13 @@ def _truth_path(arguments: argparse.Namespace) -> Path:
 
 def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:
     from arm_companion.clock import run_simulated  # noqa: PLC0415
+    from arm_companion.service_log import logging_to  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_simulated  # noqa: PLC0415
 
     script, log = SCENARIOS[arguments.scenario].fly, _record_path(arguments)
-    return run_simulated(fly_simulated(config, progress.say, prepare, log, fly=script, flown_by=stack))
+    with logging_to(arguments.output / "daemon.log"):
+        return run_simulated(fly_simulated(config, progress.say, prepare, log, fly=script, flown_by=stack))
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:

@@ -78,16 +78,14 @@ def _draw_position(axis: Axes, flight: Flight, config: Config, start: float) -> 
 
 def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
     axis.set_ylabel("move while\nheld, mm")
-    hold = next((mark for mark in flight.marks if mark.name in ("hold", "hang")), None)
     perched = [(a, b) for name, a, b in flight.spans() if name in ("PERCHED", "HANGING")]
-    if hold is None or not perched:
+    if not perched:
         axis.text(0.5, 0.5, "never perched", transform=axis.transAxes, ha="center", color=_INK)
         return
-    origin = [
-        sum(s.state.position_w[i] for s in flight.within(hold.start, hold.end))
-        / max(len(flight.within(hold.start, hold.end)), 1)
-        for i in range(3)
-    ]
+    # from where it hovers before it is asked to move; in a scenario that asks for no moves, from where it is on average
+    hold = next(((mark.start, mark.end) for mark in flight.marks if mark.name in ("hold", "hang")), perched[0])
+    held = flight.within(*hold)
+    origin = [sum(s.state.position_w[i] for s in held) / max(len(held), 1) for i in range(3)]
     samples = flight.within(perched[0][0], perched[-1][1])
     t = [s.t - start for s in samples]
     for i, (name, colour) in enumerate((("north", _X), ("east", _Y), ("down", _Z))):
@@ -150,7 +148,7 @@ def _draw_tendons(axis: Axes, flight: Flight, config: Config, start: float) -> N
             alpha=0.5,
         )
     axis.set_ylabel("tendon tension, N\n(thin: estimated)")
-    axis.legend(loc="upper left", ncols=4, fontsize=8, frameon=False)
+    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.0, ncols=4, fontsize=8, frameon=False)
 
 
 def _draw_force(axis: Axes, flight: Flight, start: float) -> None:
@@ -167,14 +165,25 @@ def _draw_force(axis: Axes, flight: Flight, start: float) -> None:
             label=f"{name} predicted",
         )
     axis.set_ylabel("force on the airframe, N\n(line: true, dots: predicted)")
-    axis.legend(loc="upper left", ncols=3, fontsize=8, markerscale=3, frameon=False)
+    axis.legend(
+        loc="lower left",
+        bbox_to_anchor=(0.0, 1.0),
+        borderaxespad=0.0,
+        ncols=3,
+        fontsize=8,
+        markerscale=3,
+        frameon=False,
+    )
 
 
 def _draw_contact(axis: Axes, flight: Flight, start: float) -> None:
     t = [s.t - start for s in flight.samples]
     axis.plot(t, [s.truth.contact_force_n for s in flight.samples], color=_INK, lw=0.9)
     axis.set_ylabel("contact force, N")
+    axis.set_ylim(bottom=0.0, top=max(1.0, axis.get_ylim()[1]))  # none at all is a line at zero
     right = axis.twinx()
     right.plot(t, [s.truth.wrap_angle for s in flight.samples], color=_X, lw=0.9)
     right.set_ylabel("wrap angle, rad", color=_X)
+    right.margins(x=0)  # it shares the time, which has none
+    right.set_ylim(bottom=0.0, top=max(1.0, right.get_ylim()[1]))
     right.spines["right"].set_visible(True)

@@ -157,4 +157,4 @@ def show_summary(title: str, done: str, summary: Summary, stream: TextIO) -> Non
 
 
 def _mm(metres: float) -> str:
-    return "-" if math.isnan(metres) else f"{metres * 1e3:.1f} mm"
+    return "-" if math.isnan(metres) else f"{metres * 1e3:z.1f} mm"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Coroutine
 from typing import Any
 
 from arm_companion.config.schema import Config
+from arm_companion.ground.texts import SEVERITIES, Sentences
 from arm_companion.protocol.dialect import mav
 from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight, Mark, PayloadSeen, TendonsSeen, Vec3, WrenchSeen
 from arm_companion.sim.operator_link import Address, OperatorLink
@@ -26,6 +27,7 @@ _CARRY_S = 4.0
 _TOLD_S = 0.3  # until a state that has just been left is not told any more
 _OFFBOARD = 6
 _GUIDED = 4
+_WARNINGS = SEVERITIES[: mav.MAV_SEVERITY_WARNING + 1]
 _CUSTOM_MODE = mav.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 
 
@@ -43,6 +45,8 @@ class Operator:
         self.say = say
         self._arm = (1, config.vehicle.component_id)
         self._autopilot = (1, 1)
+        self._sentences: dict[Address, Sentences] = {}  # of each who speaks
+        self._warned = ""
         link.watch(self._see)
 
     # --- what is seen ---
@@ -71,9 +75,13 @@ class Operator:
             case "ARM_PAYLOAD":
                 flight.payloads.append(PayloadSeen(t, message.mass, message.mass_sigma, bool(message.valid)))
             case "STATUSTEXT":
-                flight.texts.append((t, message.text))
-                if message.severity <= mav.MAV_SEVERITY_WARNING:
-                    self.say(f"“{message.text}”")
+                speaker = (message.get_srcSystem(), message.get_srcComponent())
+                for sentence in self._sentences.setdefault(speaker, Sentences()).take(message):
+                    flight.texts.append((t, sentence.text))
+                    # an autopilot that is asked once a second says no in the same words each time
+                    if sentence.severity in _WARNINGS and sentence.text != self._warned:
+                        self._warned = sentence.text
+                        self.say(f"“{sentence.text}”")
 
     @property
     def state(self) -> str:

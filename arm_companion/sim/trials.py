@@ -5,6 +5,7 @@ A trial is drawn from its seed alone, so that a failure is flown again with `--t
 
 import collections
 import dataclasses
+import logging
 import math
 import multiprocessing
 import os
@@ -251,6 +252,7 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
     Raises:
         ConfigError: the configuration cannot be used.
     """
+    logging.getLogger("arm_companion").addHandler(logging.NullHandler())  # the outcome says it, with its seed
     config = load(file, settings, os.environ)
     drawn = draw(config, seed)
     script = SCENARIOS[scenario]

@@ -1,14 +1,19 @@
 """Gusts, and perches that are taken back: the wind itself, the verdict on aborts, and the flights."""
 
+import dataclasses
 import io
 import json
 import math
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.figure import Figure as MatplotlibFigure
 from rich.console import Console
 
 from arm_companion.__main__ import main
@@ -16,12 +21,15 @@ from arm_companion.cli import sim as cli
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.errors import LinkError
+from arm_companion.protocol.dialect import mav
 from arm_companion.sim.abort_verdict import LET_GO_WITHIN_S, judge_aborts
+from arm_companion.sim.figure import _draw_contact, _draw_moves
 from arm_companion.sim.flight import Flight, Mark
 from arm_companion.sim.mishaps import ABORTED_IN, fly_aborts, fly_in_gusts, fly_one_abort
 from arm_companion.sim.ports import PlantTruth, RigidState, RotorCommand
 from arm_companion.sim.progress import show_verdict
 from arm_companion.sim.runner import Result, fly_simulated
+from arm_companion.sim.scenario import Operator
 from arm_companion.sim.verdict import judge
 from arm_companion.sim.wind import Wind
 from arm_companion.sim.world import Sample, World
@@ -179,7 +187,68 @@ def test_a_flight_leaves_nothing_of_an_earlier_one_and_its_verdict_whatever_the_
     assert ("no port" if how == "fails" else "Is a directory") in err
 
 
+def test_a_world_for_people_is_not_simulated(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "world", "--simulated", "--output", str(tmp_path)]) == 2
+    assert "leave out --simulated" in capsys.readouterr().err
+
+
+def test_the_operator_shows_whole_sentences_and_none_again_and_again() -> None:
+    said: list[str] = []
+    flight = Flight()
+    watchers: list[Callable[[Any], None]] = []
+    link: Any = SimpleNamespace(watch=watchers.append)
+    Operator(link, load("sim.toml"), flight, said.append)
+
+    def text(source: int, words: str, id_: int = 0, chunk: int = 0) -> None:
+        message = mav.MAVLink_statustext_message(mav.MAV_SEVERITY_WARNING, words.encode(), id_, chunk)
+        message.get_header().srcSystem, message.get_header().srcComponent = 1, source
+        watchers[0](message)
+
+    async def main() -> None:
+        long = "REACH -> DEPART: no contact 6 cm past where the bar should be"
+        for _ in range(3):
+            text(1, "Arming denied: estimator not ready")
+        text(192, long[:50], 7, 0)
+        text(1, "another speaks in between")
+        text(192, long[50:], 7, 1)
+        assert said == [
+            "“Arming denied: estimator not ready”",
+            "“another speaks in between”",
+            f"“{long}”",
+        ]
+        assert [words for _, words in flight.texts].count("Arming denied: estimator not ready") == 3
+
+    run_simulated(main())
+
+
+def test_no_move_is_no_negative_one() -> None:
+    stream = io.StringIO()
+    verdict = dataclasses.replace(judge_aborts(aborted(6.0), ""), hover_error_m=-0.00001)
+    show_verdict("Aborted perches", verdict, Console(file=stream, width=200), [])
+    assert "-0.0 mm" not in stream.getvalue()
+    assert "0.0 mm" in stream.getvalue()
+
+
 def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").touch()
     assert main(["sim", "perch", "--simulated", "--output", str(tmp_path / "file")]) == 78
     assert "--output" in capsys.readouterr().err
+
+
+def test_the_picture_of_a_perch_without_moves_shows_what_it_did_on_the_bar() -> None:
+    flight = aborted(6.0)
+    flight.states = [(0.0, "READY"), (2.0, "PERCHED"), (5.0, "STOWED")]
+    axis = MatplotlibFigure().subplots()
+    _draw_moves(axis, flight, 0.0)
+    assert not axis.texts, "it was perched"
+    assert [line.get_label() for line in axis.lines] == ["north", "east", "down"]
+
+
+def test_no_contact_is_a_line_at_zero_and_time_has_no_margin() -> None:
+    axis = MatplotlibFigure().subplots()
+    axis.margins(x=0)
+    flight = aborted(6.0)
+    flight.samples[:] = [s for s in flight.samples if not s.truth.contact_force_n]
+    _draw_contact(axis, flight, 0.0)
+    assert axis.get_ylim() == (0.0, 1.0)
+    assert axis.get_xlim() == (flight.samples[0].t, flight.samples[-1].t)

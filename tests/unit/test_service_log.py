@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from arm_companion.service_log import JournalFormatter, priority
+from arm_companion.service_log import JournalFormatter, logging_to, priority
 
 
 def test_levels_are_syslogs() -> None:
@@ -58,3 +58,18 @@ def test_the_daemon_marks_its_lines_for_journald_alone(tmp_path: Path, journald:
     assert re.search(rf"^{marks}WARNING arm_companion\.drivers\.servo_bus: ", said, re.MULTILINE)
     assert bool(re.search(r"^<6>INFO ", said, re.MULTILINE)) is journald
     assert all(line.startswith("<") is journald for line in said.splitlines())
+
+
+def test_a_daemon_within_another_program_logs_to_a_file_and_not_to_its_terminal(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = logging.getLogger("arm_companion.app")
+    with logging_to(tmp_path / "daemon.log"):
+        log.info("STOWED -> READYING")
+        log.warning("no contact")
+    log.info("afterwards")
+    assert (tmp_path / "daemon.log").read_text().splitlines() == [
+        "INFO arm_companion.app: STOWED -> READYING",
+        "WARNING arm_companion.app: no contact",
+    ]
+    assert capfd.readouterr().err == ""
