@@ -33,6 +33,13 @@ def add_live_argument(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def in_words(error: Exception) -> str:
+    """What an error says, without the number and the quotes that Python gives those of the system."""
+    if isinstance(error, OSError) and error.strerror:
+        return ": ".join(str(part) for part in (error.filename, error.strerror) if part)
+    return str(error)
+
+
 def load_from(arguments: argparse.Namespace) -> Config:
     """The configuration that the arguments name, with what the environment overrides.
 

@@ -9,6 +9,7 @@ import sys
 from collections.abc import Awaitable, Callable
 from typing import Any, Final, TypeAlias
 
+from arm_companion.cli.common import in_words
 from arm_companion.errors import ArmError
 
 DONE: Final = 0
@@ -161,7 +162,7 @@ def _with_arm(arguments: argparse.Namespace, action: Action) -> int:
     except CommandFailed as error:
         return _ended(arguments, FAILED, error.result, error.reason, str(error))
     except (ArmError, OSError) as error:
-        return _ended(arguments, FAILED, "failed", str(error))
+        return _ended(arguments, FAILED, "failed", in_words(error))
 
 
 def _ended(arguments: argparse.Namespace, code: int, result: str, reason: str, words: str = "") -> int:

@@ -261,7 +261,8 @@ def _plain(parameter: Parameter) -> dict[str, object]:
 
 
 def _line(parameter: Parameter) -> str:
-    value = f"{parameter.value:.9g}" if math.isfinite(parameter.value) else "?"
+    digits = 7 if parameter.kind == "real32" else 10  # what a float of 32 bits holds, and a whole number
+    value = f"{parameter.value:.{digits}g}" if math.isfinite(parameter.value) else "?"
     return f"{parameter.name:<16}  {value:>14}  {parameter.kind}"
 
 

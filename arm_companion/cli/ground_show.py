@@ -10,6 +10,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any, Final
 
+from arm_companion.cli.common import in_words
 from arm_companion.cli.ground import DONE, FAILED, Action, say, tell
 from arm_companion.cli.ground_orders import interrupts
 from arm_companion.clock import Clock, ticks, unix_now
@@ -173,7 +174,8 @@ def plot_record(arguments: argparse.Namespace) -> int:
             entries = list(read_jsonl(stream))
         return _draw(arguments, entries, path.name)
     except (ArmError, OSError, UnicodeDecodeError) as error:
-        print(f"arm-companion ground: {path}: {error}", file=sys.stderr)
+        what = in_words(error) if isinstance(error, OSError) else f"{path}: {error}"
+        print(f"arm-companion ground: {what}", file=sys.stderr)
         return FAILED
 
 

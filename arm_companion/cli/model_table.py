@@ -44,7 +44,7 @@ def _pose(answer: dict[str, Any]) -> list[str]:
     plane = math.degrees(math.atan2(R[1, 2], R[0, 2])) if tilt > 1e-9 else 0.0
     return [
         _row("tip position", [1e3 * x for x in answer["tip_position_m"]], "mm", 3),
-        f"{'end disk tilted by':<24}{tilt:10.3f}  deg towards {plane:.3f} deg",
+        f"{'end disk tilted by':<24}{tilt:10.3f}  deg towards {plane:z.3f} deg",
     ]
 
 

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
             (output / f"{picture.name}.png").write_bytes(picture.png)
         file.write_text(page(flight, verdict, drawn, arguments.title or f"Flight {log.stem}"), encoding="utf-8")
     except OSError as error:
-        print(f"arm-companion report: {error}", file=sys.stderr)
+        print(f"arm-companion report: {error.filename or output}: {error.strerror}", file=sys.stderr)
         return 1
     if arguments.json:
         found = {"grade": verdict.grade, "headline": verdict.headline, "points": verdict.points, "page": str(file)}

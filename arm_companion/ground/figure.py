@@ -68,12 +68,17 @@ def _draw_states(axes: Sequence[Axes], statuses: list[tuple[float, Status]], sta
         axis.grid(axis="y", color="#e5e7eb", lw=0.6)
 
 
+def _legend(axis: Axes) -> None:
+    """Beside the picture: within it no corner stays free of lines, and above it are the states."""
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=7, frameon=False)
+
+
 def _draw_bend(axis: Axes, statuses: list[tuple[float, Status]], start: float) -> None:
     t = [t - start for t, _ in statuses]
     axis.plot(t, [math.degrees(s.theta) for _, s in statuses], color=_COLOURS[0], label="bend")
     axis.plot(t, [math.degrees(s.goal_theta) for _, s in statuses], color=_COLOURS[0], ls=":", label="asked")
     axis.set_ylabel("bend, deg")
-    axis.legend(loc="upper left", fontsize=7, frameon=False)
+    _legend(axis)
 
 
 def _draw_tensions(axis: Axes, reports: list[tuple[float, Tendons]], start: float) -> None:
@@ -83,10 +88,10 @@ def _draw_tensions(axis: Axes, reports: list[tuple[float, Tendons]], start: floa
             by_tendon.setdefault(tendon.index, []).append((t - start, tendon.tension))
     for index, points in sorted(by_tendon.items()):
         colour = _COLOURS[index % len(_COLOURS)]
-        axis.plot([t for t, _ in points], [n for _, n in points], color=colour, label=f"tendon {index}", lw=1)
+        axis.plot([t for t, _ in points], [n for _, n in points], color=colour, label=f"tendon {index + 1}", lw=1)
     axis.set_ylabel("tension, N")
     if by_tendon:
-        axis.legend(loc="upper left", fontsize=7, frameon=False, ncols=4)
+        _legend(axis)
 
 
 def _draw_vector(axis: Axes, wrenches: list[tuple[float, Wrench]], of: str, start: float) -> None:
@@ -101,4 +106,4 @@ def _draw_vector(axis: Axes, wrenches: list[tuple[float, Wrench]], of: str, star
         axis.fill_between(t, lower, upper, color=_COLOURS[i], alpha=0.15, lw=0)
     axis.set_ylabel(f"{of}, {'N' if of == 'force' else 'N m'} (body)")
     if wrenches:
-        axis.legend(loc="upper left", fontsize=7, frameon=False, ncols=3)
+        _legend(axis)

@@ -103,7 +103,7 @@ def _tendons(arm: Arm) -> RenderableType:
         full = min(max(tendon.tension / _FULL_N, 0.0), 1.0) if math.isfinite(tendon.tension) else 0.0
         trouble = "silent" if tendon.silent else f"error 0x{tendon.hardware_error:02x}" if tendon.hardware_error else ""
         table.add_row(
-            str(tendon.index),
+            str(tendon.index + 1),  # people count from one, messages from zero
             f"{_number(tendon.tension, 1)} ±{_number(tendon.tension_sigma, 1)}",
             ProgressBar(total=1.0, completed=full, width=16),
             _number(1e3 * tendon.displacement, 2),
@@ -158,4 +158,4 @@ def _degrees(radians: float) -> str:
 
 
 def _number(value: float, digits: int) -> str:
-    return f"{value:.{digits}f}" if math.isfinite(value) else "-"
+    return f"{value:z.{digits}f}" if math.isfinite(value) else "-"

@@ -42,6 +42,14 @@ HEARD: Final = (
 _CLASSES: Final = {cls.msgname: cls for cls in mav.mavlink_map.values()}
 _LOOK_S: Final = 0.1
 """How often to look for new systems. MAVSDK can call when one appears, but not for those that it knows already."""
+_REFUSED: Final = {
+    "CONNECTION_URL_INVALID": "no address like udpin://HOST:PORT, udpout://HOST:PORT, tcpout://HOST:PORT "
+    "or serial://DEVICE:BAUD",
+    "BIND_ERROR": "another program has this port, or no network of this machine has this address",
+    "CONNECTION_ERROR": "it cannot be opened",
+    "DESTINATION_IP_UNKNOWN": "no such host is known",
+    "BAUDRATE_UNKNOWN": "not a speed of a serial line",
+}
 _LEVELS: Final = {LogLevel.ERROR: logging.WARNING, LogLevel.WARN: logging.INFO}
 
 
@@ -82,7 +90,7 @@ class Station:
             try:
                 await mavsdk.add_any_connection(url)
             except MavsdkConnectionError as error:
-                raise LinkError(f"{url}: {str(error).removeprefix('Connection failed: ')}") from error
+                raise LinkError(f"{url}: {_why(error)}") from error
             station._start(station._find_systems())
             yield station
         finally:
@@ -154,6 +162,12 @@ class Station:
         for direct in self._direct.values():
             direct.destroy()
         await asyncio.to_thread(self._mavsdk.destroy)
+
+
+def _why(error: MavsdkConnectionError) -> str:
+    """MAVSDK's name for what is wrong, in words where a person has typed something wrong."""
+    name = str(error).removeprefix("Connection failed: ")
+    return _REFUSED.get(name, name)
 
 
 def _fields_json(message: Message) -> str:

@@ -1,6 +1,7 @@
 """What is heard of one component, direct and inside TUNNEL, and where private messages go."""
 
 import asyncio
+import io
 import json
 import math
 from collections.abc import Callable
@@ -9,11 +10,12 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from arm_companion.drivers.status_text import LONGEST, status_texts
 from arm_companion.drivers.targets import read_object
 from arm_companion.ground.reports import Payload, Status, Tendons, as_json
-from arm_companion.ground.screen import summary
+from arm_companion.ground.screen import Rates, screen, summary
 from arm_companion.ground.texts import Sentences
 from arm_companion.mission.motion import rotate
 from arm_companion.protocol.dialect import mav
@@ -209,6 +211,26 @@ def test_an_object_is_told_as_the_arm_reads_it(scripted: Any) -> None:
     assert thing.radius == pytest.approx(0.03)
     axis = rotate(thing.attitude_wo or (1.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     assert axis == pytest.approx((math.cos(0.5), math.sin(0.5), 0.0))
+
+
+def test_people_count_tendons_from_one_and_nothing_is_no_negative(scripted: Any, make_status: Make) -> None:
+    many = [0] * 4
+
+    async def main() -> None:
+        scripted.say(make_status("READY"))
+        pulls, tensions = [-1e-6] * 4, [4.0] * 4
+        scripted.say(
+            mav.MAVLink_arm_tendons_message(0, pulls, pulls, tensions, tensions, many, many, many, many, 0, 4, 0, 15)
+        )
+        await scripted.arm.first(Tendons)
+        stream = io.StringIO()
+        Console(file=stream, width=120).print(screen(scripted.arm, "udpin://x", Rates()))
+        lines = [line.strip("│ ").split() for line in stream.getvalue().splitlines()]
+        rows = [words for words in lines if words and words[0] in {"0", "1", "2", "3", "4"}]
+        assert [words[0] for words in rows] == ["1", "2", "3", "4"]
+        assert not any("-0.00" in words for words in rows)
+
+    scripted.run(main)
 
 
 def test_what_is_carried_is_shown_while_it_is_told(scripted: Any, make_status: Make) -> None:

@@ -14,9 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arm_companion.__main__ import main
+from arm_companion.cli.ground_orders import _line
 from arm_companion.errors import ArmError, ProtocolError
 from arm_companion.ground.figure import draw
 from arm_companion.ground.jog import LARGEST_THETA, Jog, split_keys
+from arm_companion.ground.parameters import Parameter
 from arm_companion.ground.qgc import actions, as_text
 from arm_companion.ground.recording import Entry, Recording, format_of, read_jsonl
 from arm_companion.ground.reports import Status, Tendon, Tendons, Wrench, as_json
@@ -105,6 +107,25 @@ def test_reports_are_plain_json(make_status: Callable[..., Message]) -> None:
 def test_of_nothing_there_is_no_picture(tmp_path: Path) -> None:
     with pytest.raises(ArmError, match="nothing to draw"):
         draw([(1.0, TEXT)], tmp_path / "y.png")
+
+
+def test_a_record_that_is_not_there_is_told_in_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    record = tmp_path / "none.jsonl"
+    assert main(["ground", "plot", str(record), "--output", str(tmp_path / "y.png")]) == 1
+    assert capsys.readouterr().err == f"arm-companion ground: {record}: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    ("value", "kind", "shown"),
+    [(0.8999999761581421, "real32", "0.9"), (2147483647.0, "int32", "2147483647"), (math.nan, "real32", "?")],
+)
+def test_a_parameter_is_shown_with_the_digits_that_it_has(value: float, kind: str, shown: str) -> None:
+    assert _line(Parameter("PERCH_BEND_SPD", value, kind, 0, 1)).split() == ["PERCH_BEND_SPD", shown, kind]
+
+
+def test_an_address_of_no_kind_is_told_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ground", "status", "--connect", "nonsense://"]) == 1
+    assert "udpin://HOST:PORT" in capsys.readouterr().err
 
 
 def test_plot_draws_a_record_without_an_arm(
