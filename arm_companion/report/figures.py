@@ -85,6 +85,11 @@ def _draw(flight: RecordedFlight, plan: Callable[[Axes, RecordedFlight], None]) 
         return stream.getvalue()
 
 
+def _legend(axis: Axes) -> None:
+    """Above the picture: within it no corner stays free of lines."""
+    axis.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=5, borderaxespad=0.2)
+
+
 def _vector(axis: Axes, flight: RecordedFlight, value: Array, sigma: Array, true: str) -> None:
     for i, name in enumerate("xyz"):
         if flight.truth:
@@ -98,7 +103,7 @@ def _vector(axis: Axes, flight: RecordedFlight, value: Array, sigma: Array, true
         low, high = float(finite.min()), float(finite.max())
         margin = 0.35 * max(high - low, 1e-3)
         axis.set_ylim(low - margin, high + margin)
-    axis.legend(loc="upper left", ncols=3)
+    _legend(axis)
 
 
 def _force(axis: Axes, flight: RecordedFlight) -> None:
@@ -119,7 +124,7 @@ def _tensions(axis: Axes, flight: RecordedFlight) -> None:
         if flight.truth:
             axis.plot(flight.truth["t"], flight.truth["tension"][:, i], color=colour, lw=1.0, ls=":")
     axis.set_ylabel("tension, N")
-    axis.legend(loc="upper left", ncols=2)
+    _legend(axis)
 
 
 def _position(axis: Axes, flight: RecordedFlight) -> None:
@@ -127,7 +132,7 @@ def _position(axis: Axes, flight: RecordedFlight) -> None:
         axis.plot(flight.t, sign * flight.position_w[:, i], color=_COLOURS[i], lw=1.2, label=name)
         axis.plot(flight.t, sign * flight.setpoint_w[:, i], color=_COLOURS[i], lw=1.0, ls=":")
     axis.set_ylabel("position, m")
-    axis.legend(loc="upper left", ncols=3)
+    _legend(axis)
 
 
 def _error(axis: Axes, flight: RecordedFlight) -> None:
@@ -143,7 +148,7 @@ def _temperature(axis: Axes, flight: RecordedFlight) -> None:
     for i in range(flight.temperature.shape[1]):
         axis.plot(flight.t, flight.temperature[:, i], color=_COLOURS[i % len(_COLOURS)], label=f"servo {i + 1}")
     axis.set_ylabel("temperature, °C")
-    axis.legend(loc="upper left", ncols=2)
+    _legend(axis)
 
 
 def _links(axis: Axes, flight: RecordedFlight) -> None:
@@ -153,7 +158,7 @@ def _links(axis: Axes, flight: RecordedFlight) -> None:
         )
     axis.set_yscale("log")
     axis.set_ylabel("age, s")
-    axis.legend(loc="upper left", ncols=2)
+    _legend(axis)
 
 
 def _servos(axis: Axes, flight: RecordedFlight) -> None:
@@ -167,7 +172,7 @@ def _servos(axis: Axes, flight: RecordedFlight) -> None:
             label=f"servo {i + 1}",
         )
     axis.set_ylabel("age, ms")
-    axis.legend(loc="upper left", ncols=2)
+    _legend(axis)
     right = axis.twinx()
     right.plot(flight.t, np.fmin.reduce(flight.voltage, axis=1), color=_INK, lw=1.0, ls="--")
     right.set_ylabel("lowest voltage, V (dashed)")
