@@ -141,6 +141,8 @@ def locate(file: str | Path, *, plain: bool = False) -> Path:
     try:
         if path.is_file():
             return path
+        if path.is_dir():
+            raise ConfigError(f"{file}: a folder, and no configuration file")
     except OSError as error:  # a folder that this user may not look into
         raise ConfigError(f"{file}: cannot be read: {error.strerror}") from None
     if plain or path.name == str(file) or path.parent.name == "configs":

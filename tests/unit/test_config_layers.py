@@ -25,6 +25,11 @@ from arm_companion.ground.arm import OUR_ADDRESS
 ROOT = Path(__file__).parents[2]
 
 
+def test_a_folder_is_no_configuration_and_is_called_one(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="a folder"):
+        load(tmp_path)
+
+
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     """A configuration with a base and two drop-ins."""
