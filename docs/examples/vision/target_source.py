@@ -13,6 +13,7 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -97,18 +98,26 @@ def target(seen: Sighting, pose: VehiclePose, camera_position: Sequence[float], 
     )
 
 
+def address(text: str) -> tuple[str, int]:
+    """Host and port of a URL."""
+    host, _, port = text.removeprefix("udpout:").rpartition(":")
+    if not host or not port.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not udpout:HOST:PORT")
+    return host, int(port)
+
+
 def main() -> int:
     """Send what is seen, until Ctrl-C."""
     parser = argparse.ArgumentParser(description="Tell the arm where the bar is.")
-    parser.add_argument("--arm", default="udpout:127.0.0.1:14570", help="the arm's link of role peer")
-    parser.add_argument("--camera-position", type=float, nargs=3, default=(0.10, 0.0, 0.03), help="m, body axes")
+    parser.add_argument("--arm", type=address, default="udpout:127.0.0.1:14570", help="the arm's link of role peer")
+    place: dict[str, Any] = {"type": float, "nargs": 3, "metavar": ("X", "Y", "Z"), "default": (0.10, 0.0, 0.03)}
+    parser.add_argument("--camera-position", help="m, body axes", **place)
     arguments = parser.parse_args()
-    host, _, port = arguments.arm.removeprefix("udpout:").rpartition(":")
     link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    link.connect((host, int(port)))
+    link.connect(arguments.arm)
     codec = mav.MAVLink(None, srcComponent=ME)
     codec.robust_parsing = True
-    pose, system, told = VehiclePose(), 0, 0.0
+    pose, system, told, said = VehiclePose(), 0, 0.0, ""
     while True:
         if select.select([link], [], [], PERIOD_S)[0]:
             try:
@@ -127,6 +136,11 @@ def main() -> int:
             mav.MAVLink_heartbeat_message(mav.MAV_TYPE_ONBOARD_CONTROLLER, mav.MAV_AUTOPILOT_INVALID, 0, 0, 4, 3)
         ]
         fresh = pose.position is not None and pose.attitude is not None and told - pose.heard < OLD_S
+        doing = "waiting for the vehicle's pose" if system else "waiting for the arm's link"
+        doing = "telling what is seen" if system and fresh else doing
+        if doing != said:
+            said = doing
+            print(doing, flush=True)
         if system and fresh and (seen := detect()) is not None:
             messages.append(target(seen, pose, arguments.camera_position, system))
         for message in messages:
