@@ -25,12 +25,19 @@ def add_live_argument(parser: argparse.ArgumentParser) -> None:
     """`--live`."""
     parser.add_argument(
         "--live",
-        type=Address.read,
+        type=_address,
         nargs="?",
         const=Address(),
         metavar="HOST:PORT",
         help=f"serve a live view for Foxglove (default: {Address()}); whoever reaches it can look",
     )
+
+
+def _address(text: str) -> Address:
+    try:
+        return Address.read(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT, such as {Address()}") from None
 
 
 def in_words(error: Exception) -> str:

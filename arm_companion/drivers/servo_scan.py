@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import errno
 from collections.abc import AsyncIterator, Callable, Iterable
 from dataclasses import dataclass
 
@@ -36,6 +37,9 @@ class FoundServo:
         """Model and firmware for people."""
         name = "XL430-W250" if self.model == ct.MODEL_NUMBER_XL430_W250 else f"model {self.model}"
         return f"{name}, firmware {self.firmware}"
+
+
+_NO_PORT = (errno.ENOENT, errno.EACCES, errno.ECONNREFUSED)  # whatever the speed
 
 
 @contextlib.asynccontextmanager
@@ -75,7 +79,7 @@ async def scan(
         report: told what is being done and what is odd.
 
     Raises:
-        LinkError: the port cannot be opened at any of the speeds.
+        LinkError: the port cannot be opened at any of the speeds, or is not there.
     """
     found: list[FoundServo] = []
     refused: list[LinkError] = []
@@ -86,6 +90,8 @@ async def scan(
             async with link_at(open_at, baud) as link:
                 found += await _at_one_speed(link, baud, sorted(set(ids)), report)
         except LinkError as error:
+            if isinstance(error.__cause__, OSError) and error.__cause__.errno in _NO_PORT:
+                raise
             refused.append(error)
             report(str(error))
     if len(refused) == len(asked) and refused:

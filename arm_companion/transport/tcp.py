@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import os
 import socket
 from collections import deque
 from collections.abc import Callable
@@ -190,7 +191,9 @@ def tcp_out(host: str, port: int) -> Opener:
         except TimeoutError:
             raise LinkError(f"cannot reach tcp {host}:{port}: no answer in {_CONNECT_TIMEOUT_S:g} s") from None
         except OSError as error:
-            raise LinkError(f"cannot reach tcp {host}:{port}: {error}") from error
+            # asyncio puts its own words and the address around the system's
+            reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error
+            raise LinkError(f"cannot reach tcp {host}:{port}: {reason}") from error
         return connection
 
     return connect

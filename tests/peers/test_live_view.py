@@ -17,6 +17,7 @@ import pytest
 import websockets
 from mcap.reader import make_reader
 
+from arm_companion.__main__ import main
 from arm_companion.__main__ import main as command_line
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
@@ -261,6 +262,12 @@ def test_words_that_are_no_address_are_refused() -> None:
     for text in ("9000", "127.0.0.1", "example.org:9000", "127.0.0.1:0", "127.0.0.1:70000", "127.0.0.1:x", ""):
         with pytest.raises(ValueError, match=r"port|address"):
             Address.read(text)
+
+
+def test_an_address_for_looking_is_asked_for_in_words(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["run", "--live", "nonsense"])
+    assert "'nonsense' is not HOST:PORT, such as 127.0.0.1:8765" in capsys.readouterr().err
 
 
 def test_simulated_time_has_no_live_view(capsys: pytest.CaptureFixture[str]) -> None:

@@ -152,6 +152,11 @@ def test_scan_lives_with_speeds_that_the_adapter_has_not(bench: Bench, capsys: p
     assert "arm-companion: cannot open /dev/ttyTEST" in capsys.readouterr().err
 
 
+def test_a_port_that_is_not_there_is_told_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["servos", "scan", "--config", "sim.toml", "--port", str(tmp_path / "none")]) == 1
+    assert capsys.readouterr().err.count("cannot open") == 1
+
+
 def test_scan_writes_nothing(bench: Bench) -> None:
     before = [dict(servo.values) for servo in bench.emulator.servos]
     assert call("scan") == 0
