@@ -74,7 +74,7 @@ def _components(axis: Axes, travel: Travel, values: Sequence[tuple[float, ...]],
     time = [s.time for s in travel.samples]
     for i, (name, colour) in enumerate((("x", _X), ("y", _Y), ("z", _Z))):
         axis.plot(time, [v[i] for v in values], color=colour, lw=1.4, label=f"{letter}{name}")
-    axis.legend(fontsize=8, frameon=False, loc="lower center")
+    axis.legend(fontsize=8, frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
     right = axis.twinx()
     right.plot(time, [1e3 * s.travel for s in travel.samples], "--", color="#dc2626", lw=1.2)
     right.set_ylabel("travel, mm", color="#dc2626")

@@ -105,7 +105,7 @@ def fly(vehicles: int, host: str, port: int, output: Path) -> int:
             for setting in settings(number, folder, host, port):
                 words += ["--set", setting]
             flights.append(subprocess.Popen(words, stdout=subprocess.DEVNULL))
-        print(f"{vehicles} vehicles fly; their logs and records: {output}", flush=True)
+        print(f"vehicles that fly: {vehicles}; their logs and records: {output}", flush=True)
         ends = [flight.wait() for flight in flights]
     for number, end in enumerate(ends, 1):
         where = output / str(number) / "daemon.log"
