@@ -166,7 +166,7 @@ class Autopilot:
             self.counters.setpoints_unsent += 1
             return
         if self._path is not None:
-            if control_of(self._heartbeat, self._config.autopilot) is not Control.EXTERNAL:
+            if not self._flies_our_path(self._heartbeat):
                 self._path.reset()
             setpoint = self._path.shaped(setpoint, now)
         stamp = None if self._timesync is None else self._timesync.autopilot_time(now)
@@ -279,6 +279,8 @@ class Autopilot:
             self._link.system_id = self.system_id  # we are a part of the vehicle that we fly on
         came_back = now - self._heartbeat_at > self._config.heartbeat_timeout_s
         self._heartbeat, self._heartbeat_at = beat, now
+        if self._path is not None and not self._flies_our_path(beat):
+            self._path.reset()
         if came_back:
             self._check_now.set()
         if not self._mismatch_told and not fits(beat, self._config.autopilot):
@@ -288,6 +290,14 @@ class Autopilot:
                 beat.autopilot,
                 self._config.autopilot,
             )
+
+    def _flies_our_path(self, beat: Message) -> bool:
+        """Whether the autopilot's integrators still hold what the path handed over: no entry into GUIDED, no landing.
+
+        Asked at every heartbeat too, because set-points stop in the cycle in which the pilot takes over.
+        """
+        armed = bool(beat.base_mode & mav.MAV_MODE_FLAG_SAFETY_ARMED)
+        return armed and control_of(beat, self._config.autopilot) is Control.EXTERNAL
 
     def _on_attitude(self, m: Message, now: float) -> None:
         q = (m.q1, m.q2, m.q3, m.q4)

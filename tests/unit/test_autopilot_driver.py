@@ -374,6 +374,35 @@ def test_ardupilot_is_told_of_a_force_anew_with_every_entry_into_guided(fly: Cal
     fly(body, autopilot="ardupilot")
 
 
+@pytest.mark.parametrize(("mode", "armed"), [(5, True), (4, False)], ids=["the pilot had it", "it was disarmed"])
+def test_a_force_that_ardupilot_held_is_forgotten_though_nothing_was_sent_meanwhile(
+    fly: Callable[..., None], mode: int, armed: bool
+) -> None:
+    """Set-points stop when the pilot takes over, so the driver has to see by itself that GUIDED begins anew."""
+    force = Setpoint((1.0, 2.0, -3.0), (0.0, 0.0, 0.0), (1.5, 0.0, 0.5), 0.0)
+    still = Setpoint((1.0, 2.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0.0)
+
+    async def body(rig: Rig) -> None:
+        async def send(setpoint: Setpoint, seconds: float) -> Any:
+            for i in range(round(seconds * 100)):
+                if i % 100 == 0:
+                    rig.peer.heartbeat(ARDUPILOT, GUIDED)
+                    await asyncio.sleep(0.001)
+                rig.autopilot.send(setpoint, asyncio.get_running_loop().time())
+                await asyncio.sleep(0.009)
+            return rig.peer.all("SET_POSITION_TARGET_LOCAL_NED")[-1]
+
+        await send(force, 6.0)
+        for _ in range(10):
+            rig.peer.heartbeat(ARDUPILOT, mode, armed=armed)
+            await asyncio.sleep(1.0)
+        told = await send(still, 1.0)
+        assert (told.x, told.y, told.z) == pytest.approx(still.position_w)
+        assert (told.afx, told.afy, told.afz) == (0.0, 0.0, 0.0)
+
+    fly(body, autopilot="ardupilot")
+
+
 def test_a_setpoint_for_nobody_is_counted(fly: Callable[..., None]) -> None:
     async def body(rig: Rig) -> None:
         rig.autopilot.send(SETPOINT, 0.0)
