@@ -136,11 +136,12 @@ FOLLOWS = CARRYING | TIP | frozenset({Phase.APPROACH, Phase.REACH, Phase.DEPART}
 
 @dataclass(frozen=True)
 class Vigil:
-    """For how long each doubtful fact has held, s, and where the vehicle was in the cycle before.
+    """For how long each doubtful fact has held, s, and where the vehicle was when it was seen last.
 
     Attributes:
-        position_w: of the vehicle, m; None: it was not fresh.
-        velocity_w: of the vehicle, m/s.
+        position_w: of the vehicle when it was fresh last, m; None: too long ago to be compared with.
+        velocity_w: of the vehicle then, m/s.
+        unseen_s: for how long it has not been fresh.
         astray_s: a free vehicle is far from its reference.
         hot_s: a servo is close to its temperature limit.
         low_s: the supply is close to its lower limit.
@@ -155,6 +156,7 @@ class Vigil:
 
     position_w: Vec3 | None = None
     velocity_w: Vec3 = ZERO
+    unseen_s: float = 0.0
     astray_s: float = 0.0
     hot_s: float = 0.0
     low_s: float = 0.0
@@ -247,6 +249,7 @@ class State:
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
     armed: bool = False  # of the previous step, to see the motors stop
     streaming: bool = False  # set-points go out
+    moved_at: float | None = None  # loop time of the last that moved the vehicle; None: who flies now is not ours
     bend: tuple[float, float] = (0.0, 0.0)  # rad, commanded now
     bend_goal: tuple[float, float] = (0.0, 0.0)  # rad
     streamed: bool = False  # the goal comes from a stream of set-points

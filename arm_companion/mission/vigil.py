@@ -16,6 +16,8 @@ VOLTAGE_MARGIN_V = 0.5
 """The supply is called low by so much before a servo reports it."""
 
 _JUMP_M = 0.25  # more than the estimator's noise, less than what hurts at a bar
+_GAP_S = 1.0  # without a fresh position, after which the vehicle may be anywhere
+_BURST_M_PER_S2 = 0.75  # a quarter of the acceleration with which a hover ends and another begins unseen
 _JUMPS = 8  # that are remembered one by one
 _AWAY_S = 3.0
 _ASTRAY_M = 0.5  # the reference moves at half a metre a second, and a multirotor lags it by less than a second
@@ -38,10 +40,15 @@ def keep_vigil(s: Situation) -> State:
     before = state.vigil
     if _new_frame(s):
         before = replace(before, jumps=())
+    if s.vehicle_fresh:
+        vehicle = s.facts.vehicle
+        before = replace(before, position_w=vehicle.position_w, velocity_w=vehicle.velocity_w, unseen_s=0.0)
+    else:
+        unseen_s = before.unseen_s + s.t - s.state.t
+        known = max(unseen_s, s.facts.vehicle.position_age_s) <= _GAP_S
+        before = replace(before, unseen_s=unseen_s, position_w=before.position_w if known else None)
     vigil = replace(
         before,
-        position_w=s.facts.vehicle.position_w if s.vehicle_fresh else None,
-        velocity_w=s.facts.vehicle.velocity_w,
         astray_s=time(before.astray_s, holds=_astray(s)),
         hot_s=time(
             before.hot_s, holds=any(t.temperature > servos.temperature_limit_c - HEAT_MARGIN_K for t in answering)
@@ -79,19 +86,19 @@ def _blind(s: Situation) -> bool:
 
 
 def _leap(s: Situation) -> Vec3 | None:
-    """By how much the estimator moved the vehicle since the last cycle, m; None when the vehicle may have flown it.
+    """By how much the estimator moved the vehicle since it was seen last, m; None when the vehicle may have flown it.
 
-    Between two positions lie at most the way that the greater of both speeds makes, and the estimator's noise.
+    Between two positions lie at most the way that the greater of both speeds makes, and the estimator's noise; after
+    a gap, which is how many an estimator begins anew, what may have been flown unseen besides.
     """
     last, vehicle = s.state.vigil, s.facts.vehicle
     if last.position_w is None or not s.vehicle_fresh:
         return None
     way = sub(vehicle.position_w, last.position_w)
     speed = max(norm(vehicle.velocity_w), norm(last.velocity_w))
-    elapsed = s.t - s.state.t + s.config.vehicle.state_timeout_s
-    if norm(way) <= _JUMP_M + speed * elapsed:
-        return None
-    return sub(way, scale(vehicle.velocity_w, s.dt))
+    gap = last.unseen_s + s.t - s.state.t
+    flown = speed * (gap + s.config.vehicle.state_timeout_s) + _BURST_M_PER_S2 * gap**2
+    return sub(way, scale(vehicle.velocity_w, gap)) if norm(way) > _JUMP_M + flown else None
 
 
 def _move_frame(s: Situation, leap: Vec3) -> State:

@@ -11,7 +11,21 @@ from arm_companion.mission.motion import Reference, add
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Phase, Prediction, Sharing, State, Vigil
 from arm_companion.mission.vigil import HEAT_MARGIN_K, VOLTAGE_MARGIN_V, keep_vigil
-from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Change, gripping, jaws, memory, moved, tendon, vehicle
+from tests.unit.mission_rig import (
+    ANCHOR,
+    BENT,
+    DT,
+    PLACE,
+    T0,
+    Change,
+    Run,
+    gripping,
+    jaws,
+    memory,
+    moved,
+    tendon,
+    vehicle,
+)
 
 Hovering = Callable[..., Facts]
 LEAP = (0.0, 1.0, 0.5)
@@ -213,3 +227,20 @@ def test_a_place_that_is_not_fresh_neither_jumps_nor_is_compared_with(
     assert after.vigil.leap_m == 0.0
     assert after.vigil.position_w is None
     assert kept(after, moved(LEAP)(hovering()), parameters).vigil.leap_m == 0.0
+
+
+@pytest.mark.parametrize(("gap_s", "off", "jumps"), [(0.4, 0.45, True), (0.4, 0.3, False), (1.5, 3.0, False)])
+def test_a_jump_behind_a_short_gap_is_one_of_what_could_not_be_flown_meanwhile(
+    gap_s: float, off: float, jumps: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """An estimator that is set anew says nothing for a moment; after a long one the vehicle may be anywhere."""
+    run = Run(memory(Phase.RELEASE, bend=BENT), parameters)
+    run.cycles(hovering(BENT), 0.1)
+    for i in range(round(gap_s / DT)):
+        run.cycle(vehicle(position_age_s=0.2 + DT * i)(hovering(BENT)))
+    elsewhere = moved((off, 0.0, 0.0))(hovering(BENT))
+    said = run.cycle(elsewhere)
+    assert (run.state.vigil.jumped_at == run.state.t) is jumps
+    if jumps:  # a vehicle that is still half wrapped is not dragged along
+        assert said.setpoint is not None
+        assert said.setpoint.position_w == pytest.approx(elsewhere.vehicle.position_w, abs=0.1)
