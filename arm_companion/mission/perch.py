@@ -201,7 +201,7 @@ def cannot_depart(s: Situation) -> str | None:
     """The arm is clear but the vehicle is not ours to move, or nobody knows any more where the bar was met."""
     if not unwrapped(s):
         return None
-    if not s.external:
+    if not (s.external and s.state.streaming):  # given back, it is ours to move once READY has said so
         return "arm clear; the vehicle is not ours to move"
     return "arm clear; where the bar was met is not known" if s.state.contact_w is None else None
 

@@ -91,7 +91,7 @@ def _motors_carry(s: Situation) -> bool:
     share = motor_share(s)
     if share is not None:
         return share >= s.config.hang.carried_share
-    lifts = s.facts.vehicle.throttle >= _LEAST_THROTTLE if throttle_known(s) else s.external
+    lifts = s.facts.vehicle.throttle >= _LEAST_THROTTLE if throttle_known(s) else s.external and s.state.streaming
     return lifts and -sunk(s) >= _ROSE_M
 
 

@@ -404,6 +404,18 @@ def test_a_height_that_drifts_opens_no_arm_over_idle_motors(
     assert (Phase.UNLOAD in run.phases) is opens
 
 
+def test_a_vehicle_given_back_without_ready_is_not_flown_by_us_and_does_not_rise_by_drifting(
+    above: Parameters, wrapped: Facts
+) -> None:
+    run = Run(memory(Phase.HANG_HOLD, streaming=False, reference=None, sharing=Sharing(first=PLACE[2])), above)
+    quiet = vehicle(throttle_age_s=9.0)(wrapped)
+    run.cycle(ask(quiet, Order.RELEASE))
+    x, y, z = PLACE
+    for i in range(400):
+        run.cycle(vehicle(position_w=(x, y, z - min(0.0005 * i, 0.06)))(quiet))
+    assert run.phases == [Phase.HANG_HOLD, Phase.TAKE_BACK]
+
+
 @pytest.mark.parametrize("bent", [0.0, 0.25, 0.4])
 def test_the_thrust_of_idling_motors_is_that_of_the_curve_that_they_flew_with(
     above: Parameters, hanging: Bar, bent: float
