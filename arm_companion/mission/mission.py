@@ -25,12 +25,13 @@ from arm_companion.mission.facts import (
     TensionEstimate,
 )
 from arm_companion.mission.jog import follow_stream, jog
+from arm_companion.mission.motion import ZERO
 from arm_companion.mission.notices import TOLD_IN
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
 from arm_companion.mission.situation import Parameters, Situation
-from arm_companion.mission.state import CALIBRATES, PerchKind, Phase, Prediction, Running, State
+from arm_companion.mission.state import CALIBRATES, MOVES_VEHICLE, PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.tries import given_up
 from arm_companion.mission.vigil import keep_vigil
@@ -84,6 +85,7 @@ def step(state: State, facts: Facts, t: float, parameters: Parameters) -> tuple[
         prediction=prediction,
         control=facts.vehicle.control,
         armed=facts.vehicle.armed,
+        moved_at=_moved_at(situation),
     )
     commands = Commands(
         arm,
@@ -126,6 +128,15 @@ def _estimate(s: Situation) -> State:
         position=smooth_position(state.position, s.facts.vehicle, s.dt),
         sharing=keep_sharing(s),
     )
+
+
+def _moved_at(s: Situation) -> float | None:
+    """When our set-points last asked the vehicle to move, or pushed; None: it is not ours."""
+    state = s.state
+    if not (s.external and state.streaming and s.facts.vehicle.armed):
+        return None
+    pushes = state.moved_at is not None and state.lean != ZERO
+    return s.t if state.phase in MOVES_VEHICLE or pushes else state.moved_at
 
 
 def _yield_to_pilot(s: Situation, notices: list[Notice]) -> Situation:

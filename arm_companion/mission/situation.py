@@ -20,6 +20,7 @@ from arm_companion.values import replace
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
 _NEAR_M = 0.15
+_COMES_TO_REST_S = 3.0  # of set-points that may get lost
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
 
 
@@ -126,9 +127,12 @@ class Situation:
         """Whether set-points go out in this phase.
 
         PX4 accepts the switch to external control only with a stream, and leaves it without one. ArduPilot needs
-        none, holds by itself, and takes any set-point for the end of a take-off.
+        none, holds by itself, and takes any set-point for the end of a take-off. But it flies on for seconds with the
+        velocity and acceleration of the last one, so that one which moves is followed by some that rest.
         """
-        return self.config.vehicle.autopilot == "px4" or self.state.phase in MOVES_VEHICLE
+        moved = self.state.moved_at
+        resting = moved is not None and self.t - moved < _COMES_TO_REST_S
+        return self.config.vehicle.autopilot == "px4" or self.state.phase in MOVES_VEHICLE or resting
 
     @property
     def pilot_took_over(self) -> bool:

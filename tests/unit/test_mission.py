@@ -143,6 +143,39 @@ def test_set_points_do_not_come_back_by_themselves_when_the_pilot_gives_control_
     assert all(c.setpoint is None for c in said)
 
 
+def test_a_vehicle_given_back_without_ready_is_left_alone_when_the_arm_has_let_go(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    held = at(Phase.HOLDING, anchor=ANCHOR, contact_w=(2.0, 0.0, -2.2), bend=(3.0, 0.0), bend_goal=(3.0, 0.0))
+    held = dataclasses.replace(held, streaming=False, reference=None)
+    state, first = run(held, ask(hovering((3.0, 0.0)), Order.RELEASE), parameters)
+    state, later = run(state, hovering(), parameters, 8.0)
+    assert state.phase is Phase.STOWED
+    assert [a.result for a in answers(first + later)][-1] is Result.ACCEPTED
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+def test_set_points_that_moved_the_vehicle_are_followed_by_some_that_rest(
+    parameters: Parameters, hovering: Hovering, autopilot: str
+) -> None:
+    """ArduPilot flies on for three seconds with the last velocity and acceleration that it was told."""
+    flown = dataclasses.replace(parameters.config.vehicle, autopilot=autopilot)
+    parameters = Parameters(dataclasses.replace(parameters.config, vehicle=flown), parameters.model)
+    moving = Reference((2.0, 0.0, -2.2), (0.5, 0.0, 0.0))
+    before = dataclasses.replace(at(Phase.APPROACH, contact_w=(2.942, 0.0, -2.18)), reference=moving)
+    state, said = run(before, hovering(), parameters)
+    assert said[-1].setpoint is not None
+    assert said[-1].setpoint.velocity_w[0] > 0.4
+    jumped = hovering(position_w=(2.0, 1.0, -2.2))
+    state, said = run(state, jumped, parameters, 0.9)
+    assert state.phase is Phase.STOWING
+    assert {None if c.setpoint is None else c.setpoint.velocity_w for c in said} == {(0.0, 0.0, 0.0)}
+    _, said = run(state, jumped, parameters, 4.0)
+    assert (said[-1].setpoint is None) is (autopilot == "ardupilot")
+    _, said = run(state, hovering(control=Control.PILOT, mode="LOITER"), parameters, 1.0)
+    assert all(c.setpoint is None for c in said), "the pilot wins meanwhile too"
+
+
 def test_a_set_point_is_always_complete_and_finite(parameters: Parameters, hovering: Hovering) -> None:
     for phase in Phase:
         _, said = run(at(phase, anchor=ANCHOR), hovering(), parameters, 0.1)
