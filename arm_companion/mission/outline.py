@@ -60,7 +60,7 @@ def _wrapped(s: Situation, rod: ArmSolution) -> tuple[Array, Array]:
 
     Base axes, m.
     """
-    radius = s.bar.radius + s.config.perch.disk_radius_m
+    radius = s.held_radius + s.config.perch.disk_radius_m
     inward = np.array((*s.towards_bar_a, 0.0))
     length = max(s.parameters.model.parameters.L - s.config.perch.free_arc_m, 0.0)
     turn = np.linspace(0.0, length / radius, _WRAPPED_POINTS)[:, None]
@@ -74,14 +74,15 @@ def _bar(s: Situation, held_at: Array | None) -> BarSeen | None:
     if not s.vehicle_fresh:
         return None
     R_bw = so3.from_quaternion(s.facts.vehicle.attitude_wb).T
-    axis = R_bw @ np.asarray(s.bar.axis_w)
+    held = held_at is not None
+    axis = R_bw @ np.asarray(s.held_axis_w if held else s.bar.axis_w)
     point = held_at
     if point is None:
         point = R_bw @ (np.asarray(s.bar.point_w) - np.asarray(s.facts.vehicle.position_w))
         point = point + axis * float(axis @ (s.mount.position - point))
     if not math.isfinite(float(point.sum())):
         return None
-    return BarSeen(_vec3(point), _vec3(axis), s.bar.radius)
+    return BarSeen(_vec3(point), _vec3(axis), s.held_radius if held else s.bar.radius)
 
 
 def _vec3(v: Array) -> Vec3:

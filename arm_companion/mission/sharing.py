@@ -59,7 +59,7 @@ def sunk(s: Situation) -> float:
 def slid(s: Situation) -> float:
     """The greater of the vehicle's moves down and along the bar within the last seconds, m: swinging is no slip."""
     away = sub(s.state.position, s.state.sharing.place)
-    return max(away[2], abs(dot(away, s.bar.axis_w)))
+    return max(away[2], abs(dot(away, s.held_axis_w)))
 
 
 def keep_sharing(s: Situation) -> Sharing:

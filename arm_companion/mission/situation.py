@@ -352,6 +352,18 @@ class Situation:
         return self.state.anchor.position_w if self.state.anchor else self.facts.vehicle.position_w
 
     @property
+    def held_radius(self) -> float:
+        """Radius of the bar that the arm is wrapped around, m, whatever is told of bars since."""
+        anchor = self.state.anchor
+        return self.bar.radius if anchor is None or anchor.bar_radius is None else anchor.bar_radius
+
+    @property
+    def held_axis_w(self) -> Vec3:
+        """Its direction, unit, world axes."""
+        anchor = self.state.anchor
+        return self.bar.axis_w if anchor is None or anchor.bar_axis_w is None else anchor.bar_axis_w
+
+    @property
     def rest(self) -> Vec3:
         """Vehicle position in which the anchored arm asks for nothing."""
         return self.probe if self.state.rest is None else self.state.rest

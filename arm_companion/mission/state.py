@@ -95,7 +95,7 @@ class Running:
 
 @dataclass(frozen=True)
 class Anchor:
-    """Vehicle and arm at the moment when the grip was taken for good.
+    """Vehicle and arm at the moment when the grip was taken for good, and the bar: another may be told meanwhile.
 
     Attributes:
         position_w: of the vehicle, m.
@@ -104,6 +104,8 @@ class Anchor:
         section_position_a: where the bar holds the arm, base axes of that moment, m.
         section_attitude_as: of the held cross-section in those axes.
         beyond: by how much the wrapped part shortens each tendon's path, m; empty when the model found none.
+        bar_radius: of the bar that it holds, m; None: that of the bar that is told.
+        bar_axis_w: its direction, unit; None: the same.
     """
 
     position_w: Vec3
@@ -112,6 +114,8 @@ class Anchor:
     section_position_a: Vec3 = ZERO
     section_attitude_as: Quaternion = (1.0, 0.0, 0.0, 0.0)
     beyond: tuple[float, ...] = ()
+    bar_radius: float | None = None
+    bar_axis_w: Vec3 | None = None
 
 
 @dataclass(frozen=True)

@@ -142,7 +142,8 @@ def grip(s: Situation) -> Anchor:
     arm, length = model.parameters, s.config.perch.free_arc_m
     u = arm.H.T @ np.asarray(tension) * (length / arm.EI)
     R_as, p_as = arc.tip_rotation(u), arc.tip_position(u, length)
-    free = Anchor(s.state.position, attitude, tension, _vec3(p_as), so3.to_quaternion(R_as))
+    section, bar = so3.to_quaternion(R_as), s.bar
+    free = Anchor(s.state.position, attitude, tension, _vec3(p_as), section, (), bar.radius, bar.axis_w)
     try:
         held = model.anchor(_hold(s, free), np.asarray(s.pulls), np.asarray(tension), np.asarray(s.gravity_a))
     except ModelError:
@@ -176,7 +177,8 @@ def _hold(s: Situation, anchor: Anchor) -> Hold:
     A closed wrap rolls and turns on the bar but stays on it: what holds is the point on the bar's axis.
     """
     x, y = s.towards_bar_a
-    centre = s.bar.radius + s.config.perch.disk_radius_m
+    radius = s.bar.radius if anchor.bar_radius is None else anchor.bar_radius
+    centre = radius + s.config.perch.disk_radius_m
     return Hold(
         s.config.perch.free_arc_m,
         Pose.of_quaternion(anchor.section_attitude_as, np.asarray(anchor.section_position_a)),

@@ -12,6 +12,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import load
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
+from arm_companion.mission.facts import Bar as ToldBar
 from arm_companion.mission.payload import ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Parameters
@@ -123,6 +124,21 @@ def test_a_vehicle_that_does_not_come_to_rest_is_not_unloaded_further(above: Par
     first = 1.0 - (1.0 - above.config.hang.idle_share) / above.config.hang.steps
     assert bar.run.state.sharing.share >= first - 1e-9
     assert bar.run.state.phase is Phase.LOAD_TRANSFER
+
+
+def test_a_bar_that_is_told_meanwhile_turns_no_swinging_into_a_slip(hanging: Bar) -> None:
+    bar, run = hanging, hanging.run
+    x, y, z = PLACE
+    z += SPRING_M * (1.0 - bar.throttle / HOVER_THROTTLE)
+    anchor = run.state.anchor
+    assert anchor is not None
+    run.state = dataclasses.replace(run.state, anchor=dataclasses.replace(anchor, bar_axis_w=(0.0, 1.0, 0.0)))
+    along_swing = dataclasses.replace(bar.facts, bar=ToldBar((9.0, 0.0, -2.5), (1.0, 0.0, 0.0), 0.02), bar_age_s=0.1)
+    for i in range(300):
+        bar.cycle(along_swing, position_w=(x + 0.08 * math.sin(0.04 * i), y, z))
+    assert run.state.phase is Phase.HANGING
+    bar.cycle(along_swing, position_w=(x, y + 0.15, z))
+    bar.until(Phase.TAKE_BACK, 1.0, position_w=(x, y + 0.15, z))
 
 
 @pytest.mark.parametrize("phase", [Phase.LOAD_TRANSFER, Phase.HANGING])

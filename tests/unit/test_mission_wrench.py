@@ -14,7 +14,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.errors import NoSolution
 from arm_companion.mission.estimate import ForceObserver
-from arm_companion.mission.facts import Facts, Vec3, WrenchReport
+from arm_companion.mission.facts import Bar, Facts, Vec3, WrenchReport
 from arm_companion.mission.motion import norm, rotate
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
@@ -44,6 +44,19 @@ def moving(parameters: Parameters, facts: Facts) -> State:
     anchor = grip(Situation(state, facts, T0, parameters))
     assert anchor.beyond
     return dataclasses.replace(state, anchor=anchor, rest=PLACE, offset=(0.01, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.1])
+def test_a_bar_that_is_told_meanwhile_changes_nothing_about_the_one_that_is_held(
+    radius: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = hovering(BENT)
+    state = moving(parameters, facts)
+    next_bar = dataclasses.replace(facts, bar=Bar((3.0, 0.0, -2.0), (1.0, 0.0, 0.0), radius), bar_age_s=0.1)
+    (kept, before), (other, after) = (run(state, told, parameters, 3.0) for told in (facts, next_bar))
+    assert norm(kept.lean) > 0.05
+    assert other.lean == kept.lean
+    assert after[-1].wrench == before[-1].wrench
 
 
 @pytest.fixture
