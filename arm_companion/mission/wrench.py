@@ -215,7 +215,7 @@ def _wrench(s: Situation, solution: ArmSolution | None, *, holding: bool) -> Wre
     elif (load := carry.payload(s)) is not None:
         found = _gripped(found, s, load.mass)
     # how the bar pushes on an arm that touches but does not hold is not known
-    report = _report(found, source, valid=source is not WrenchSource.CONTACT)
+    report = _report(found, source, valid=source is not WrenchSource.CONTACT and _shape_known(s))
     return hung_wrench(s, report, solution.moments.mass) if s.state.phase in SHARING else report
 
 
@@ -230,6 +230,11 @@ def _motion(s: Situation, *, holding: bool) -> BodyMotion:
         return BodyMotion(rate=rate)
     north, east = s.state.force.acceleration(vehicle, s.config.vehicle.mass_kg)
     return BodyMotion(so3.from_quaternion(vehicle.attitude_wb).T @ np.array((north, east, 0.0)), rate)
+
+
+def _shape_known(s: Situation) -> bool:
+    """Whether every tendon is where it says: of a silent servo nobody knows, nor of one that lost its turns."""
+    return all(tendon.homed and not tendon.silent for tendon in s.facts.tendons)
 
 
 def _touches(s: Situation) -> bool:

@@ -20,7 +20,7 @@ from arm_companion.mission.payload import Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
 from arm_companion.mission.state import Anchor, Phase, State
 from arm_companion.mission.wrench import grip
-from tests.unit.mission_rig import BENT, PLACE, T0, gripping, memory, moved, run, vehicle
+from tests.unit.mission_rig import BENT, PLACE, T0, Change, gripping, memory, moved, run, tendon, vehicle
 
 Hovering = Callable[..., Facts]
 
@@ -57,6 +57,19 @@ def test_a_bar_that_is_told_meanwhile_changes_nothing_about_the_one_that_is_held
     assert norm(kept.lean) > 0.05
     assert other.lean == kept.lean
     assert after[-1].wrench == before[-1].wrench
+
+
+@pytest.mark.parametrize("change", [tendon(0, homed=False, pull=0.05), tendon(2, silent=True)])
+@pytest.mark.parametrize("phase", [Phase.STARTUP, Phase.STOWED, Phase.PERCHED])
+def test_a_wrench_from_tendons_that_nobody_knows_is_not_valid(
+    phase: Phase, change: Change, parameters: Parameters, hovering: Hovering
+) -> None:
+    facts = hovering(BENT if phase is Phase.PERCHED else (0.0, 0.0))
+    state = moving(parameters, facts) if phase is Phase.PERCHED else memory(phase)
+    _, said = run(state, facts, parameters, 0.2)
+    assert said[-1].wrench.valid
+    _, said = run(state, change(facts), parameters, 0.2)
+    assert not said[-1].wrench.valid
 
 
 @pytest.fixture
