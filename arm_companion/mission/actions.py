@@ -58,6 +58,7 @@ _NUDGE_M_PER_S = 0.01
 _ACCELERATION = 0.6
 _YAW_RATE = 0.6
 _FAR_FACTOR = 3.0
+_STILL_FAR_M = 0.5
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
 _AT_REST_M = 0.002
@@ -104,6 +105,8 @@ def _prepare(s: Situation) -> State:
                 reference=state.reference or _here(s),
                 tries=state.tries + 1,
             )
+        case Phase.DEPART if _far_before_standoff(s):
+            return replace(state, contact_w=None)  # what ends an approach so early is no reason to come nearer
         case Phase.REACH:
             force = replace(state.force, tared_s=0.0, since_s=0.0, above_s=0.0)
             return replace(state, force=force, contact_w=s.place(0.0))
@@ -126,6 +129,13 @@ def _prepare(s: Situation) -> State:
         case Phase.UNLOAD:
             return replace(state, offset=ZERO, bend_goal=state.bend)
     return state
+
+
+def _far_before_standoff(s: Situation) -> bool:
+    """Whether the vehicle still has a way to go to the stand-off, and not one back to it."""
+    before = s.state.contact_w
+    least = s.config.perch.standoff_m + _STILL_FAR_M
+    return before is not None and norm(sub(s.facts.vehicle.position_w, before)) > least
 
 
 def _of_this_bar(s: Situation) -> State:
@@ -195,12 +205,13 @@ def _ahead_of_the_others(s: Situation) -> bool:
     """Whether the commanded curl has to wait, for servos that turn late or a vehicle that does not follow a wrap.
 
     Bending on regardless would end in a jerk of servos that catch up, or in a bar that pulls the vehicle over. An
-    arm that lets go waits for its servos alone: the vehicle may be what holds it up.
+    arm that lets go waits for its servos alone: the vehicle may be what holds it up. For one that has failed nobody
+    waits: the others open the arm as far as they can.
     """
     reference, phase = s.state.reference, s.state.phase
     if phase not in (*_CURLS, Phase.RELEASE) or reference is None:
         return False
-    if s.bend_error > _BEND_AHEAD_RAD:
+    if s.bend_error > _BEND_AHEAD_RAD and s.servo_fault is None:
         return True
     behind = norm(sub(reference.position, s.facts.vehicle.position_w))
     return phase in _CURLS and (behind > _BEHIND_CURL_M or not s.vehicle_fresh)

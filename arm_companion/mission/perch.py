@@ -137,11 +137,13 @@ def pose_check_failed(s: Situation) -> str | None:
 
 
 def at_standoff(s: Situation) -> str | None:
-    """The vehicle rests at the stand-off, facing the bar."""
+    """The vehicle rests at the stand-off, facing the bar; in DEPART also where an approach was ended far before it."""
     goal = s.standoff
     reference = s.state.reference
     ok = reference is not None and arrived(reference, goal) and at(s, goal, _AT_STANDOFF_M)
-    return "at the stand-off" if ok else None
+    if not ok:
+        return None
+    return "at rest, far from the bar" if s.state.contact_w is None else "at the stand-off"
 
 
 def ready_to_try_again(s: Situation) -> str | None:

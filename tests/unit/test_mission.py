@@ -176,6 +176,40 @@ def test_set_points_that_moved_the_vehicle_are_followed_by_some_that_rest(
     assert all(c.setpoint is None for c in said), "the pilot wins meanwhile too"
 
 
+@pytest.mark.parametrize("silent", [True, False])
+def test_an_arm_that_lets_go_waits_for_a_late_servo_and_not_for_a_dead_one(
+    parameters: Parameters, hovering: Hovering, silent: bool
+) -> None:
+    """The others open the arm as far as they can; a vehicle was left on its bar by one servo without power."""
+    bent = (4.7, 0.0)
+    state = at(Phase.RELEASE, contact_w=(2.0, 0.0, -2.2), bend=bent, bend_goal=(0.0, 0.0))
+    facts = hovering(bent)
+    dead = tuple(dataclasses.replace(t, silent=silent and i == 0) for i, t in enumerate(facts.tendons))
+    state, _ = run(state, dataclasses.replace(facts, tendons=dead), parameters, 6.0)
+    assert state.phase is Phase.RELEASE
+    assert state.bend == ((0.0, 0.0) if silent else pytest.approx((bent[0] - 0.3, 0.0), abs=0.1))
+
+
+@pytest.mark.parametrize(("left_m", "stays"), [(8.0, True), (0.3, False)])
+def test_an_approach_that_is_given_up_far_away_brings_the_vehicle_no_nearer(
+    parameters: Parameters, hovering: Hovering, left_m: float, stays: bool
+) -> None:
+    bar, standoff = (2.942, 0.0, -2.18), parameters.config.perch.standoff_m
+    begin = Reference((bar[0] - standoff - left_m, 0.0, -2.18), (0.4, 0.0, 0.0))
+    state = dataclasses.replace(at(Phase.APPROACH, contact_w=bar), reference=begin)
+    order: tuple[Request, ...] = (Request(7, Order.ABORT),)
+    for _ in range(1000):
+        reference = state.reference
+        assert reference is not None
+        facts = hovering(position_w=reference.position, velocity_w=reference.velocity)
+        state, _ = run(state, dataclasses.replace(facts, requests=order), parameters)
+        order = ()
+    assert state.phase is Phase.STOWED
+    assert state.reference is not None
+    way = state.reference.position[0] - begin.position[0]
+    assert way == pytest.approx(0.13 if stays else left_m, abs=0.06)
+
+
 def test_a_set_point_is_always_complete_and_finite(parameters: Parameters, hovering: Hovering) -> None:
     for phase in Phase:
         _, said = run(at(phase, anchor=ANCHOR), hovering(), parameters, 0.1)
