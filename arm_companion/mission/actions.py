@@ -77,7 +77,7 @@ def prepare(s: Situation) -> State:
         return begin(s)
     if s.state.phase in CALIBRATES:
         return calibrating.prepare(s)
-    state = _prepare(s)
+    state = _not_nearer(s) if s.state.phase is Phase.DEPART else _prepare(s)
     if s.grasping:
         state = carry.prepare(s.remembering(state))
     return gripper.begin(s.remembering(state))
@@ -94,19 +94,18 @@ def _prepare(s: Situation) -> State:
         case Phase.HOLDING | Phase.STOWED:
             return replace(_of_this_bar(s), bend=s.bend, bend_goal=s.bend, pulls=(), course=None)
         case Phase.APPROACH:
-            heading = s.heading_to_bar()  # and the bar's place: the way back is from this one, whatever is told then
+            faces = s.remembering(replace(state, heading=s.heading_to_bar()))
+            way = sub(faces.place(s.config.perch.standoff_m), s.facts.vehicle.position_w)
             return replace(
-                state,
-                heading=heading,
-                contact_w=s.remembering(replace(state, heading=heading)).place(0.0),
+                faces.state,
+                contact_w=faces.place(0.0),  # the way back is from this one, whatever is told then
+                way_m=norm(way),
                 anchor=None,
                 rest=None,
                 offset=ZERO,
                 reference=state.reference or _here(s),
                 tries=state.tries + 1,
             )
-        case Phase.DEPART if _far_before_standoff(s):
-            return replace(state, contact_w=None)  # what ends an approach so early is no reason to come nearer
         case Phase.REACH:
             force = replace(state.force, tared_s=0.0, since_s=0.0, above_s=0.0)
             return replace(state, force=force, contact_w=s.place(0.0))
@@ -131,11 +130,13 @@ def _prepare(s: Situation) -> State:
     return state
 
 
-def _far_before_standoff(s: Situation) -> bool:
-    """Whether the vehicle still has a way to go to the stand-off, and not one back to it."""
+def _not_nearer(s: Situation) -> State:
+    """Memory at the entry of DEPART: what ends an approach far before the stand-off is no reason to go on to it."""
     before = s.state.contact_w
     least = s.config.perch.standoff_m + _STILL_FAR_M
-    return before is not None and norm(sub(s.facts.vehicle.position_w, before)) > least
+    if before is None or norm(sub(s.facts.vehicle.position_w, before)) <= least:
+        return s.state
+    return replace(s.state, contact_w=None)
 
 
 def _of_this_bar(s: Situation) -> State:

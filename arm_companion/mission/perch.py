@@ -68,6 +68,12 @@ def state_timeout(s: Situation) -> str | None:
     return _too_long(s.config.perch.state_timeout_s, s.state.phase.name.lower(), s)
 
 
+def approach_late(s: Situation) -> str | None:
+    """The stand-off is not reached in the time that the way to it takes, and as much again as any moving phase has."""
+    perch = s.config.perch
+    return _too_long(perch.state_timeout_s + s.state.way_m / perch.approach_speed_m_per_s, "approach", s)
+
+
 def no_contact(s: Situation) -> str | None:
     """The reach ended, or took too long, without the bar."""
     perch = s.config.perch
@@ -371,7 +377,7 @@ TABLE: Table[Phase, Situation] = Table(
         *hang.LIMITS,
         *grasp.TIME_LIMITS,
         *calibrating.LIMITS,
-        Row(frozenset({Phase.APPROACH}), state_timeout, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.APPROACH}), approach_late, Phase.DEPART, "time limit", ArmFault.TIMEOUT),
         Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.RELEASE}), state_timeout, Phase.HOLDING, "time limit", ArmFault.TIMEOUT),

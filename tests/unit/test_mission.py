@@ -22,6 +22,7 @@ from arm_companion.mission.facts import (
     WrenchReport,
     WrenchSource,
 )
+from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Parameters, Situation
@@ -208,6 +209,27 @@ def test_an_approach_that_is_given_up_far_away_brings_the_vehicle_no_nearer(
     assert state.reference is not None
     way = state.reference.position[0] - begin.position[0]
     assert way == pytest.approx(0.13 if stays else left_m, abs=0.06)
+
+
+@pytest.mark.parametrize(("follows", "ends"), [(True, Phase.REACH), (False, Phase.STOWED)])
+def test_a_bar_at_the_end_of_a_long_way_is_come_to(
+    parameters: Parameters, hovering: Hovering, follows: bool, ends: Phase
+) -> None:
+    """PERCH takes bars up to 50 m away; half a minute is enough for 15 m."""
+    start = (-22.0, 0.0, -2.18)
+    state = dataclasses.replace(at(Phase.READY, position=start), reference=Reference(start))
+    order: tuple[Request, ...] = (Request(7, Order.PERCH),)
+    for _ in range(1200):
+        reference = state.reference
+        assert reference is not None
+        off = (0.0, 0.0 if follows else 0.3, 0.0)  # beside its way, but not astray
+        x, y, z = (a + b for a, b in zip(reference.position, off, strict=True))
+        facts = hovering(position_w=(x, y, z), velocity_w=reference.velocity)
+        state, _ = step(state, dataclasses.replace(facts, requests=order), state.t + 0.1, parameters)
+        order = ()
+        if state.phase is ends:
+            break
+    assert state.phase is ends
 
 
 def test_a_set_point_is_always_complete_and_finite(parameters: Parameters, hovering: Hovering) -> None:
