@@ -27,6 +27,7 @@ class Mesh:
         size: number of unknowns.
         modes: bend modes per axis.
         twists: twist modes.
+        degree: of the mode of each unknown (size,).
         piece: piece of each node (q,).
         nodes: arc length of each node (q,), m.
         weights: quadrature weights (q,), m.
@@ -47,6 +48,7 @@ class Mesh:
     size: int
     modes: int
     twists: int
+    degree: "np.typing.NDArray[np.intp]"
     piece: "np.typing.NDArray[np.intp]"
     nodes: Array
     weights: Array
@@ -96,13 +98,15 @@ def build(lengths: tuple[float, ...], bending: int, twist: int, per_piece: int) 
     steps = np.concatenate(moments, axis=1).reshape(-1, modes)
     place = np.arange(total)
     piece = place // per_piece
+    size = 2 * modes + (twist + 1) * count
     return Mesh(
         lengths=lengths,
         bending=bending,
         twist=twist,
-        size=2 * modes + (twist + 1) * count,
+        size=size,
         modes=modes,
         twists=(twist + 1) * count,
+        degree=np.arange(size) % modes // count,
         piece=piece,
         nodes=sealed(nodes),
         weights=sealed(weights),

@@ -10,7 +10,7 @@ from arm_companion.arm import compiled, rod_solver, statics
 from arm_companion.arm.model import ArmSolution, Hold, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_detail import RodDetail
-from arm_companion.arm.rod_equations import Loads, Rod
+from arm_companion.arm.rod_equations import FAINT, Loads, Rod
 from arm_companion.arm.rod_solver import Problem, Solved, Support
 from arm_companion.arm.rod_start import RodStart
 from arm_companion.arm.unloaded import UnloadedArm
@@ -187,7 +187,20 @@ class RodModel(UnloadedArm):
         if not imbalance <= self._refuse:
             raise NoSolution(imbalance, "the backbone bends sharper than the finest discretisation can show")
         solved.residual = max(solved.residual, imbalance)
-        return RodDetail(rod, solved, payload, beyond, level, imbalance < 1e-3 * self._tolerance)
+        return RodDetail(rod, solved, payload, beyond, level, self._would_do(level - 1, rod, solved.c))
+
+    def _would_do(self, level: int, rod: Rod, c: Array) -> bool:
+        """Whether this coarser discretisation is worth a try: the modes that it lacks hold next to no energy.
+
+        Next to what varies along the arm: the mean bend is the tendons' own, and hides what loads do.
+        """
+        if level < 0:
+            return False
+        (bending, twist, _), mesh = self._levels[level], rod.mesh
+        energy = rod.diagonal * c * c
+        missed = energy[: 2 * mesh.modes] @ (mesh.degree[: 2 * mesh.modes] > bending)
+        missed += energy[2 * mesh.modes :] @ (mesh.degree[2 * mesh.modes :] > twist)
+        return bool(missed < self._tolerance * (energy @ (mesh.degree > 0) + FAINT * rod.moment_scale))
 
     @staticmethod
     def _refined(rod: Rod, finer: Rod, goal: Problem, solved: Solved, imbalance: float) -> Solved:

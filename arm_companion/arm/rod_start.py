@@ -33,7 +33,7 @@ class RodStart:
         taut_margin: see `ArmSolution`.
         arc_length: of the modelled part, m.
         level: of the discretisations.
-        easy: whether a coarser one would have done.
+        easy: whether a coarser one is worth a try.
         payload: mass, kg, and offset, m (4,).
         beyond: path taken up beyond the modelled part (n,), m.
         stretch: the problem's pulls (n,).
