@@ -234,24 +234,28 @@ def inertial(solution: ArmSolution, T_ba: Pose, gravity: Array, motion: BodyMoti
 def _sigma(solution: ArmSolution, T_ba: Pose, at_base: Array, spread: Spread) -> Array:
     """One sigma (6,) of the transformed wrench: root of the summed squares of derivative times spread."""
     d = solution.derivatives
-    X = wrench.transform_matrix(T_ba)
-    g = solution.gravity
-    columns = (
-        (spread.EI * d.parameters["EI"])[:, None],
-        (spread.GJ * d.parameters["GJ"])[:, None],
-        (spread.k_T * d.parameters["k_T"])[:, None],
-        (spread.T0 * d.parameters["T0"])[:, None],
-        (spread.mass * (d.gravity @ g))[:, None],  # a heavier arm is the same arm in a stronger field
+    g, by = solution.gravity, d.parameters
+    parameters = (
+        spread.EI * by["EI"],
+        spread.GJ * by["GJ"],
+        spread.k_T * by["k_T"],
+        spread.T0 * by["T0"],
+        spread.mass * (d.gravity @ g),  # a heavier arm is the same arm in a stronger field
+    )
+    columns = [
+        np.array(parameters).T,
         spread.pull * d.pull,
         spread.hold_position * d.hold[:, :3],
         spread.hold_rotation * d.hold[:, 3:],
         spread.gravity_direction * (d.gravity @ so3.hat(g)),
-        spread.tip_force * d.tip_wrench[:, :3],
-    )
-    variance = ((X @ np.concatenate(columns, axis=1)) ** 2).sum(axis=1)
+    ]
+    if spread.tip_force:
+        columns.append(spread.tip_force * d.tip_wrench[:, :3])
+    variance = np.square(wrench.transform_matrix(T_ba) @ np.concatenate(columns, axis=1)).sum(axis=1)
     F, M = T_ba.rotation @ at_base[:3], T_ba.rotation @ at_base[3:]
     shifted = so3.hat(F)
-    turned = np.vstack((shifted, so3.hat(M) + so3.hat(T_ba.position) @ shifted))
-    variance += spread.mount_rotation**2 * (turned**2).sum(axis=1)
-    variance[3:] += spread.mount_position**2 * (shifted**2).sum(axis=1)
+    turned = so3.hat(M) + so3.hat(T_ba.position) @ shifted
+    by_shift = np.square(shifted).sum(axis=1)
+    variance[:3] += spread.mount_rotation**2 * by_shift
+    variance[3:] += spread.mount_rotation**2 * np.square(turned).sum(axis=1) + spread.mount_position**2 * by_shift
     return np.asarray(np.sqrt(variance))

@@ -8,7 +8,7 @@ from numpy.polynomial import legendre
 
 from arm_companion.arm import rod_solver
 from arm_companion.arm.model import Derivatives, MassMoments, Payload
-from arm_companion.arm.rod_equations import Rod, State, cross_rows
+from arm_companion.arm.rod_equations import WRAP, Rod, State, cross_rows
 from arm_companion.errors import NoSolution
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, sealed
@@ -24,7 +24,7 @@ class RodDetail:
         payload: what the end carries.
         beyond: path taken up beyond the modelled part (n,), m.
         level: which of the model's discretisations.
-        easy: whether a coarser one would have done.
+        easy: whether a coarser one is worth a try.
     """
 
     rod: Rod
@@ -37,11 +37,14 @@ class RodDetail:
     def moments(self) -> MassMoments:
         """See `Detail.moments`."""
         rod, state = self.rod, self.solved.state
-        load = state.tip + state.R_tip @ self.payload.offset
-        joints = [self._joint(k) for k in range(len(rod.joint_masses))]
-        points = np.vstack(((state.tip[:, None] - state.P).T, state.tip, load, *joints))
-        ends = [rod.end_mass, self.payload.mass, *rod.joint_masses]
-        return MassMoments.of_points(np.concatenate((rod.node_mass, ends)), points)
+        q, joints = rod.node_mass.size, len(rod.joint_masses)
+        points, masses = np.empty((q + 2 + joints, 3)), np.empty(q + 2 + joints)
+        np.subtract(state.tip, state.P.T, out=points[:q])
+        points[q], points[q + 1] = state.tip, state.tip + state.R_tip @ self.payload.offset
+        masses[:q], masses[q], masses[q + 1] = rod.node_mass, rod.end_mass, self.payload.mass
+        for k, mass in enumerate(rod.joint_masses, q + 2):
+            points[k], masses[k] = self._joint(k - q - 2), mass
+        return MassMoments.of_points(masses, points)
 
     def _joint(self, k: int) -> Array:
         """Position (3,) of the end of piece k."""
@@ -191,11 +194,10 @@ class RodDetail:
         o = state.R_tip @ self.payload.offset * self.payload.mass
         t = state.t
         rest = (t * beyond) @ mesh.outer + o[:, None]  # its moment per unit field is rest x g
-        work = np.empty((3, 3 * mesh.modes))
-        for a, b, c in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            turning = state.D[:, b] * rest[c] - state.D[:, c] * rest[b]
-            work[a] = (turning @ mesh.weighted.T).reshape(-1)
-        return work.T[: mesh.size], t @ (mesh.weights * beyond) + o
+        rest = rest[WRAP]
+        turning = state.D[:, 1:4] * rest[2:5] - state.D[:, 2:5] * rest[1:4]
+        work = (turning @ mesh.weighted.T).transpose(0, 2, 1).reshape(-1, 3)
+        return work[: mesh.size], t @ (mesh.weights * beyond) + o
 
     def _base_by_unknowns(self, state: State) -> Array:
         """d base_wrench / dc (6, size) with dead loads as they are, followers turning along."""
@@ -205,16 +207,17 @@ class RodDetail:
         n = mesh.weights * (state.F[:, None] + gravity[:, None] * self.rod.mass_beyond)
         phi = self.rod.turns(state)
         # (phi x t) x n = t (phi . n) - phi (t . n)
-        moment = (phi * n[None]).sum(axis=1) @ t.T - phi @ (t * n).sum(axis=0)
-        force = np.zeros_like(moment)
+        result = np.zeros((6, self.rod.mesh.size))
+        force, moment = result[:3].T, result[3:].T
+        moment += (phi * n).sum(axis=1) @ t.T - phi @ (t * n).sum(axis=0)
         for point, dead in loads.hung:
             moment += cross_rows(cross_rows(state.J_phi, state.R_tip @ point), dead)
         if loads.follower_force is not None:
-            force = cross_rows(state.J_phi, state.R_tip @ loads.follower_force)
+            force += cross_rows(state.J_phi, state.R_tip @ loads.follower_force)
             moment -= cross_rows(force, state.tip)
         if loads.follower_moment is not None:
             moment += cross_rows(state.J_phi, state.R_tip @ loads.follower_moment)
-        return np.vstack((force.T, moment.T))
+        return result
 
 
 def _wrench_at(p: Array) -> Array:

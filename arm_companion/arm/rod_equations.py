@@ -30,7 +30,8 @@ from arm_companion.errors import LimitViolated
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 
-_WRAP = np.array((0, 1, 2, 0, 1))
+WRAP = np.array((0, 1, 2, 0, 1))
+"""Components of a vector, wrapped."""
 _WRAP_THRICE = np.array((0, 1, 2, 0, 1, 2, 0, 1, 2))
 _SYMMETRIC = np.array((0, 1, 3, 1, 2, 4, 3, 4, 5))  # where the six distinct blocks of a symmetric 3 x 3 go
 _EYE = np.eye(3)
@@ -282,7 +283,7 @@ class Rod:
         turning = np.concatenate((_moment_of(F), _moment_of(loads.gravity)), axis=1)
         moments = turning @ PQ + M[:, None]
         m = moments[:, :q]
-        P = PQ[_WRAP, :q]
+        P = PQ[WRAP, :q]
         terms = np.empty((3, 7, q))
         np.subtract(D[:, 1:4] * P[2:5], D[:, 2:5] * P[1:4], out=terms[:, :3])
         terms[:, 3:6] = D[:, :3]
@@ -350,7 +351,7 @@ class Rod:
         mesh, D, t = self.mesh, state.D, state.t
         size, q = mesh.size, mesh.nodes.size
         phi = self.turns(state)
-        m = state.m[_WRAP]
+        m = state.m[WRAP]
         bent = D[:, 1:4] * m[2:5] - D[:, 2:5] * m[1:4]
         side = (bent[:, None] * mesh.weighted[:, None]).reshape(-1, 3, q)[:size]
         wn = mesh.weights * (state.F[:, None] + loads.gravity[:, None] * self.mass_beyond)

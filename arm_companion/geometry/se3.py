@@ -6,7 +6,7 @@ from typing import overload
 import numpy as np
 
 from arm_companion.geometry import so3
-from arm_companion.geometry.arrays import Array, ArrayLike, frozen
+from arm_companion.geometry.arrays import Array, ArrayLike, frozen, sealed
 
 _ORTHOGONAL = 1e-6  # allowed departure of R^T R from the identity
 
@@ -50,12 +50,12 @@ class Pose:
     def __matmul__(self, other: "Pose | Array") -> "Pose | Array":
         """T_ab @ T_bc -> T_ac; T_ab @ points in b (..., 3) -> points in a (..., 3)."""
         if isinstance(other, Pose):
-            return Pose(self.rotation @ other.rotation, self.rotation @ other.position + self.position)
+            return _sound(self.rotation @ other.rotation, self.rotation @ other.position + self.position)
         return np.asarray(other @ self.rotation.T + self.position)
 
     def inverse(self) -> "Pose":
         """T_ba."""
-        return Pose(self.rotation.T, -self.rotation.T @ self.position)
+        return _sound(self.rotation.T, -self.rotation.T @ self.position)
 
     def matrix(self) -> Array:
         """Homogeneous matrix (4, 4)."""
@@ -72,3 +72,11 @@ class Pose:
     def difference(self, other: "Pose") -> Array:
         """The twist (6,) that `moved` would need to bring this pose to `other`."""
         return np.concatenate((other.position - self.position, so3.log(other.rotation @ self.rotation.T)))
+
+
+def _sound(rotation: Array, position: Array) -> Pose:
+    """A pose that follows from poses, and so needs no check; the arrays become its own."""
+    pose = object.__new__(Pose)
+    object.__setattr__(pose, "rotation", sealed(rotation))
+    object.__setattr__(pose, "position", sealed(position))
+    return pose
