@@ -205,6 +205,11 @@ class ArmParameters:
         return sealed(H)
 
     @cached_property
+    def least_tension(self) -> Array:
+        """H (H^T H)^-1 (n, 2 m), 1/m: the smallest tensions that make a moment, per N m of it."""
+        return sealed(self.H @ np.linalg.inv(self.H.T @ self.H))
+
+    @cached_property
     def bending(self) -> Array:
         """EI / L of every entry of u (2 m,), N m."""
         return sealed(np.repeat([s.EI / s.L for s in self.segments], 2))

@@ -47,10 +47,9 @@ def symmetric_tension(parameters: ArmParameters, u: ArrayLike, pretension: Array
     reached with this pretension: the tendon goes slack first.
     """
     tau = np.array(np.broadcast_to(np.asarray(pretension, dtype=np.float64), (parameters.n,)))
-    H = parameters.H
     # The disks' share of the stiffness depends on the sum of tensions, which the correction hardly changes.
     for _ in range(3 if parameters.chord_loss.any() else 1):
-        tau = tau + H @ np.linalg.solve(H.T @ H, bending_moment(parameters, u, tau))
+        tau = tau + parameters.least_tension @ bending_moment(parameters, u, tau)
     return np.asarray(tau)
 
 
@@ -81,18 +80,20 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
     H, c, k = parameters.H, parameters.chord_loss, parameters.k_T
     scale = float(parameters.bending.max())
     # What rounding of the goals leaves of the moment; tendons far stiffer than the backbone make much of it.
-    rounding = _ROUNDING * float(k.max() * np.abs(H).max() * (np.abs(q).max() + np.abs(H).max())) / scale
+    reach = float(np.abs(H).max())
+    rounding = _ROUNDING * float(k.max()) * reach * (float(np.abs(q).max()) + reach) / scale
     u = np.linalg.lstsq(H, q - q.mean(), rcond=None)[0]
-    tau, residual = stretch_tension(parameters, u, q), np.inf
+    tau, residual, excess = stretch_tension(parameters, u, q), np.inf, np.inf
     for _ in range(_ITERATIONS):
         g = bending_moment(parameters, u, tau)
         residual = float(np.abs(g).max()) / scale
-        if residual < _tolerance(parameters, tau) + rounding:
+        excess = residual - _tolerance(parameters, tau) - rounding
+        if excess < 0:
             break
         u, tau = _descent(parameters, u, tau, H + 2 * c * u, k * (tau > 0), g, q)
     if (parameters.bending - 2 * tau @ c).min() <= 0:
         raise LimitViolated("sum of tensions", float(tau.sum()), 0.0, buckling_tension(parameters))
-    if residual >= _tolerance(parameters, tau) + rounding:
+    if not excess < 0:
         raise NoSolution(residual, "unloaded bend")
     return np.asarray(u)
 
