@@ -60,7 +60,12 @@ class Plant:
         self._tip = model.site(mjcf.TIP).id
         self._disks = np.array([model.geom(mjcf.disk(i)).id for i in range(config.arm.disks + 1)])
         self._mount = model.geom(mjcf.MOUNT).id
-        self._rotors = np.array([model.geom(mjcf.rotor(i)).id for i in range(4)])
+        # for every geom: whether it is one of these
+        geoms = np.arange(model.ngeom)
+        self._of_airframe = model.geom_bodyid == self._airframe
+        self._of_ground = np.isin(model.geom_bodyid, list(self._ground))
+        self._outside = self._of_ground | (model.geom_bodyid == self._bar)
+        self._rotors = np.isin(geoms, [model.geom(mjcf.rotor(i)).id for i in range(4)])
         # Number of the link that owns each geom, base 0, and -1 where a geom is no part of the arm.
         self._link_of_geom = np.full(model.ngeom, -1)
         for i in range(config.arm.disks + 1):
@@ -79,13 +84,15 @@ class Plant:
         self._straight_rest = config.arm.length_m - config.arm.tendons.pretension_n / self._stiffness
         # views of MuJoCo's own memory, made once because a step asks for them all
         self._qpos, self._qvel, self._applied = self._data.qpos, self._data.qvel, self._data.qfrc_applied[:6]
-        self._cut = self._data.cfrc_int[self._base]
+        self._cut, self._acceleration = self._data.cfrc_int[self._base], self._data.qacc
+        self._centre, self._place = self._data.subtree_com[self._airframe], self._data.xpos[self._airframe]
+        self._turn = self._data.xmat[self._airframe].reshape(3, 3).T
         self._lengths, self._rest = self._data.ten_length, model.tendon_lengthspring[:, 1]
         self._tendon_damping = model.tendon_damping
         self._longer = np.zeros(model.ntendon)  # m, by what has happened to each tendon
         self._velocity_before = np.zeros(model.nv)
         self._truth: PlantTruth | None = None
-        self._wrench_sum, self._steps = np.zeros((2, 3)), 0
+        self._wrenches: list[tuple[Vec3, Vec3]] = []  # of the steps since the mean was asked for
         self._touch = self._touched = NOTHING
         mujoco.mj_forward(model, self._data)
         self._set_pulls((0.0,) * model.ntendon)
@@ -128,24 +135,21 @@ class Plant:
         self._truth = None
         mujoco.mj_step(self._model, self._data)
         self._wrench = self._interface_wrench()
-        self._wrench_sum += self._wrench
-        self._steps += 1
+        self._wrenches.append(self._wrench)
         self._touched = self._touched.and_then(self._touch)
 
     def state(self) -> RigidState:
         """True motion of the airframe now; the specific force is the last step's mean."""
-        data = self._data
-        w, x, y, z = data.qpos[3:7].tolist()
-        rotation = _matrix(w, x, y, z)
-        acceleration = (data.qvel[:3] - self._velocity_before[:3]) / self._dt
+        *position, w, x, y, z = self._qpos[:7].tolist()
+        vx, vy, vz, p, q, r = self._qvel[:6].tolist()
+        acceleration = (self._qvel[:3] - self._velocity_before[:3]) / self._dt
         acceleration[2] += mjcf.GRAVITY
-        rate = data.qvel[3:6].tolist()
         return RigidState(
-            position_w=mjcf.up(data.qpos[:3].tolist()),
-            velocity_w=mjcf.up(data.qvel[:3].tolist()),
+            position_w=mjcf.up(position),
+            velocity_w=mjcf.up((vx, vy, vz)),
             attitude_wb=_upright(-x, w, -z, y),  # (0, 1, 0, 0) * (w, x, y, z)
-            rate_b=(rate[0], rate[1], rate[2]),
-            specific_force_b=_vec3(rotation.T @ acceleration),
+            rate_b=(p, q, r),
+            specific_force_b=_vec3(_matrix(w, x, y, z).T @ acceleration),
         )
 
     def pose(self) -> Pose:
@@ -167,9 +171,11 @@ class Plant:
 
         A wrap that slips strikes for milliseconds: one step's force says nothing of what the airframe felt.
         """
-        force, torque = self._wrench if not self._steps else (_vec3(v) for v in self._wrench_sum / self._steps)
-        self._wrench_sum[:], self._steps = 0.0, 0
-        return force, torque
+        if not self._wrenches:
+            return self._wrench
+        force, torque = np.add.reduce(self._wrenches) / len(self._wrenches)
+        self._wrenches.clear()
+        return _vec3(force), _vec3(torque)
 
     def touched(self) -> Touch:
         """What the airframe touched in the steps since this was asked last: a bump is over within milliseconds."""
@@ -232,9 +238,9 @@ class Plant:
         model, data = self._model, self._data
         force, torque = self._wrench
         contact, net, wrap = self._bar_contact()
-        bodies = model.geom_bodyid[data.contact.geom]
-        ground = np.any(np.isin(bodies, list(self._ground)), axis=1)
-        thing = np.any(bodies == self._object, axis=1)
+        geoms = data.contact.geom
+        ground = self._of_ground[geoms].any(axis=1)
+        thing = (model.geom_bodyid[geoms] == self._object).any(axis=1)
         tension = self.tensions()
         mujoco.mj_kinematics(model, data)  # the tip where it is after the step, as in `state`
         return PlantTruth(
@@ -260,35 +266,33 @@ class Plant:
         """
         model, data = self._model, self._data
         velocity = self._qvel.copy()
-        np.subtract(velocity, self._velocity_before, out=data.qacc)
-        data.qacc /= self._dt
+        np.subtract(velocity, self._velocity_before, out=self._acceleration)
+        self._acceleration /= self._dt
         self._qvel[:] = self._velocity_before
         mujoco.mj_rnePostConstraint(model, data)
         self._qvel[:] = velocity
         # torque, force of the airframe on the arm, about the tree's centre
         tx, ty, tz, fx, fy, fz = self._cut.tolist()
-        x, y, z = (data.subtree_com[self._airframe] - data.xpos[self._airframe]).tolist()
+        x, y, z = (self._centre - self._place).tolist()
         force = (-fx, -fy, -fz)
         torque = (z * fy - y * fz - tx, x * fz - z * fx - ty, y * fx - x * fy - tz)
         self._touch = NOTHING
-        if data.ncon and np.any(model.geom_bodyid[data.contact.geom] == self._airframe):
+        if data.ncon and self._of_airframe[data.contact.geom].any():
             self._touch = self._look_at_airframe()
             pushed, twisted = self._arm_against_airframe()
             force, torque = _vec3(pushed + force), _vec3(twisted + torque)
-        turn = data.xmat[self._airframe].reshape(3, 3).T.tolist()
+        turn = self._turn.tolist()
         return _turned(turn, force), _turned(turn, torque)
 
     def _look_at_airframe(self) -> Touch:
         """What the airframe touches in this step."""
         geoms = self._data.contact.geom
-        bodies = self._model.geom_bodyid[geoms]
-        outside = np.any(np.isin(bodies, [*self._ground, self._bar]), axis=1)
-        touching = outside & np.any(bodies == self._airframe, axis=1)
-        by_mount = np.any(geoms == self._mount, axis=1)
+        touching = self._outside[geoms].any(axis=1) & self._of_airframe[geoms].any(axis=1)
+        by_mount = (geoms == self._mount).any(axis=1)
         return Touch(
-            by_mount=bool(np.any(touching & by_mount)),
-            elsewhere=bool(np.any(touching & ~by_mount)),
-            rotor=bool(np.any(np.isin(geoms, self._rotors))),
+            by_mount=bool((touching & by_mount).any()),
+            elsewhere=bool((touching & ~by_mount).any()),
+            rotor=bool(self._rotors[geoms].any()),
         )
 
     def _arm_against_airframe(self) -> tuple[Array, Array]:
