@@ -54,7 +54,7 @@ check: $(STAMP)  ## lint, format, types and dependency directions
 	@$(BIN)/lint-imports
 
 bench: $(STAMP)  ## measure speed as ratios beside peers; writes build/bench.json
-	@$(BIN)/python -m tests.bench
+	@OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/python -m tests.bench  # as `arm-companion` runs
 
 docs: $(STAMP)  ## build the documentation in build/docs, and check its links
 	@$(BIN)/python -m sphinx -b html -q -W --keep-going docs build/docs
