@@ -39,7 +39,8 @@ from arm_companion.errors import DeviceFault
 from arm_companion.live.feed import Address
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Control, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.onlookers import Onlookers
 from arm_companion.record import configured_recorder

@@ -11,7 +11,7 @@ from arm_companion.doctor.machine_checks import no_config
 from arm_companion.doctor.subject import ServosSeen, Subject
 from arm_companion.drivers import calibration_files
 from arm_companion.drivers.calibration import TendonCalibration, curves, misfit, too_old
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 
 _LOSS_SHARE: Final = 0.01
 _MARGIN_V: Final = 0.5

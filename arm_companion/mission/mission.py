@@ -27,10 +27,11 @@ from arm_companion.mission.facts import (
 from arm_companion.mission.jog import follow_stream, jog
 from arm_companion.mission.motion import ZERO
 from arm_companion.mission.notices import TOLD_IN
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.perch import TABLE
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CALIBRATES, MOVES_VEHICLE, PerchKind, Phase, Prediction, Running, State
 from arm_companion.mission.tendon_watch import watch
 from arm_companion.mission.tries import given_up

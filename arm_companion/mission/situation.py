@@ -6,15 +6,13 @@ from functools import cached_property
 
 import numpy as np
 
-from arm_companion.arm.keep_out import KeepOut
-from arm_companion.arm.model import ArmModel
-from arm_companion.arm.reaction import GRAVITY, mount
+from arm_companion.arm.reaction import GRAVITY
 from arm_companion.config.schema import Config
-from arm_companion.geometry.arrays import Array
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Order, TendonState, Vec3
 from arm_companion.mission.gripper_facts import JawState
 from arm_companion.mission.motion import add, dot, norm, rotate, scale, sub, turn_by_yaw, unrotate
+from arm_companion.mission.parameters import Parameters, column
 from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.values import replace
 
@@ -22,48 +20,6 @@ _ABOVE = -0.5  # z of the arm's base axis in body axes
 _NEAR_M = 0.15
 _COMES_TO_REST_S = 3.0  # of set-points that may get lost
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """What does not change in flight."""
-
-    config: Config
-    model: ArmModel
-
-    @cached_property
-    def mount(self) -> Pose:
-        """T_ba: the arm's base on the airframe."""
-        return mount(self.config.mount.position_m, self.config.mount.rpy_deg)
-
-    @cached_property
-    def keep_out(self) -> KeepOut | None:
-        """The cone that the arm never enters; None: there is none."""
-        cone = self.config.limits.keep_out
-        if not cone.half_angle_deg:
-            return None
-        half_angle, radius = math.radians(cone.half_angle_deg), self.config.perch.disk_radius_m
-        return KeepOut.of(np.asarray(cone.apex_m), half_angle, self.mount, self.model.parameters.L, radius)
-
-    @cached_property
-    def towards_bar_a(self) -> tuple[float, float]:
-        """Direction of bending, base axes, in which a vehicle that faces the bar wraps it."""
-        x, y, _ = _column(self.mount.rotation.T, 0)  # forward in base axes
-        length = math.hypot(x, y)
-        return (x / length, y / length) if length > 0.0 else (1.0, 0.0)
-
-    @cached_property
-    def wrap_clearance(self) -> float:
-        """Least distance of arm and keep-out cone on the way to the full wrap, m; infinite without a cone."""
-        if self.keep_out is None:
-            return math.inf
-        return self.keep_out.least_on_way(np.zeros(2), self.config.perch.wrap_bend_rad * np.array(self.towards_bar_a))
-
-    def admits(self, bend: tuple[float, float], next_bend: tuple[float, float]) -> bool:
-        """Whether the keep-out cone lets the arm go on from one bend to the next, rad."""
-        if self.keep_out is None or bend == next_bend:
-            return True
-        return self.keep_out.admits(np.asarray(bend), np.asarray(next_bend))
 
 
 @dataclass(frozen=True)
@@ -316,7 +272,7 @@ class Situation:
     @property
     def straight_w(self) -> Vec3:
         """Where the straight arm of the hovering vehicle points, world axes: +z of its base, down when below."""
-        return turn_by_yaw(_column(self.mount.rotation, 2), self.state.heading)
+        return turn_by_yaw(column(self.mount.rotation, 2), self.state.heading)
 
     @property
     def ahead(self) -> Vec3:
@@ -419,10 +375,6 @@ def _point(position: tuple[float, ...]) -> Vec3:
 def _level(heading_deg: float) -> Vec3:
     heading = math.radians(heading_deg)
     return (math.cos(heading), math.sin(heading), 0.0)
-
-
-def _column(matrix: Array, j: int) -> Vec3:
-    return float(matrix[0, j]), float(matrix[1, j]), float(matrix[2, j])
 
 
 def at(s: Situation, goal: Vec3, tolerance: float) -> bool:

@@ -17,7 +17,7 @@ from arm_companion.config.table import from_table
 from arm_companion.errors import RecordError
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record.reader import Item, Reader
 from arm_companion.record.starts import started

@@ -15,7 +15,7 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.reader import Reader

@@ -29,7 +29,8 @@ from arm_companion.live.feed import Address, LiveView
 from arm_companion.live.scene import scene, transforms, turn_to
 from arm_companion.mission.facts import Notice, Severity
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import State
 from arm_companion.record.reader import Reader
 from arm_companion.record.recorder import Record

@@ -14,7 +14,7 @@ from arm_companion.drivers import recalibration
 from arm_companion.drivers.calibration import TendonCalibration
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.protocol.control_table import TICK_RAD
 from arm_companion.protocol.dialect import mav
 from arm_companion.record_codec import dumps, loads

@@ -12,7 +12,7 @@ from arm_companion import app
 from arm_companion.app import Daemon, Openers
 from arm_companion.clock import SIMULATED_EPOCH_S, Clock, run_simulated
 from arm_companion.config import load
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from arm_companion.mission.facts import Answer, ArmAction, Commands, Facts, Order, Result, Workshop
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase, State
 from arm_companion.procedures.tendon_zeros import Zero
 from tests.unit.conftest import HOVER, tendons

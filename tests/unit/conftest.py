@@ -11,7 +11,7 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import Config, load
 from arm_companion.mission.facts import Control, Facts, TendonState, VehicleState
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 
 HOVER = VehicleState(
     position_w=(2.0, 0.0, -2.2),

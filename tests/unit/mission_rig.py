@@ -15,8 +15,8 @@ from arm_companion.mission.glide import Glide
 from arm_companion.mission.gripper_facts import GripperAction, GripperState, JawState
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference, norm, sub
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.sharing import SUSPENDED
-from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import CALIBRATES, CARRYING, MOVES_VEHICLE, TIP, Anchor, Phase, Reach, Sharing, State
 from arm_companion.values import replace
 

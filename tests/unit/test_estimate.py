@@ -9,8 +9,8 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.estimate import OBSERVER_LAG_S, ForceObserver, observe_force, tare
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import DRAG_PER_S
-from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import Phase
 from tests.unit.mission_rig import DT, MET, Run, memory
 

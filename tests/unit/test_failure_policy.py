@@ -29,9 +29,10 @@ from arm_companion.mission.facts import (
 from arm_companion.mission.failure_policy import CAUSES, SITUATIONS, Cause, document, reaction
 from arm_companion.mission.gripper_facts import Grip, GripperAction, GripperOrder
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Load, ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction, State
 from arm_companion.mission.tendon_watch import TendonWatch
 from arm_companion.procedures.tendon_zeros import Zero

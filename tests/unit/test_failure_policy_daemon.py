@@ -13,7 +13,7 @@ from arm_companion.errors import CommandRejected
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.failure_policy import SITUATIONS
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase
 from arm_companion.record.file_recorder import FileRecorder
 from arm_companion.record.mcap_file import McapFile

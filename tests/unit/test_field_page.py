@@ -26,7 +26,8 @@ from arm_companion.mission.facts import Answer, Facts, Notice, Result, Severity,
 from arm_companion.mission.facts import Order as ArmOrder
 from arm_companion.mission.mission import step
 from arm_companion.mission.outline import outline
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import State
 from arm_companion.page.audience import Audience
 from arm_companion.page.gate import Gate

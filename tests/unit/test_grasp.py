@@ -11,9 +11,10 @@ import pytest
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import ArmFault, Commands, Control, Facts, GraspTarget, Order, Result, WrenchSource
 from arm_companion.mission.motion import Reference, norm
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
 from arm_companion.mission.perch import TABLE
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Phase, State
 from tests.unit.mission_rig import BENT, PLACE, T0, Run, ask, memory, moved, tendon, vehicle
 

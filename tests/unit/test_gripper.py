@@ -20,8 +20,9 @@ from arm_companion.mission.gripper_facts import (
     GripperState,
 )
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Load
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Phase, State
 from arm_companion.record_codec import dumps, loads
 from tests.unit.mission_rig import PLACE, T0, Change, Run, ask, gripping, jaws, memory, moved, tendon, vehicle

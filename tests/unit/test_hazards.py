@@ -8,7 +8,8 @@ import pytest
 
 from arm_companion.mission import hazards
 from arm_companion.mission.facts import Facts
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Vigil
 from tests.unit.mission_rig import T0, memory, tendon, vehicle
 

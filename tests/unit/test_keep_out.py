@@ -18,7 +18,7 @@ from arm_companion.errors import ConfigError
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import Facts, Order, Request, Result
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase
 from tests.unit.mission_rig import T0, memory, run
 

@@ -24,8 +24,9 @@ from arm_companion.mission.facts import (
 )
 from arm_companion.mission.mission import step
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction, Running, State
 from arm_companion.mission.wrench import grip
 from arm_companion.record_codec import dumps, loads

@@ -21,7 +21,7 @@ from arm_companion.mission.facts import (
     Result,
 )
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase, State
 from arm_companion.record_codec import dumps, loads
 from tests.unit.calibration_bench import CALIBRATE, ON_GROUND, START, ZEROS, Bench, Change, resumed

@@ -13,9 +13,9 @@ from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import load
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
 from arm_companion.mission.facts import Bar as ToldBar
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
-from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import PerchKind, Phase, Sharing, State
 from tests.unit.conftest import HOVER, tendons
 from tests.unit.mission_rig import ANCHOR, DT, PLACE, T0, Run, ask, memory, tendon, vehicle

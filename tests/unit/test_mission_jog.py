@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from arm_companion.mission.facts import ArmSetpoint, Facts, Order, Request, Result, SetpointKind
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase, State
 from tests.unit.mission_rig import run
 

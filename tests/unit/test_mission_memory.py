@@ -8,7 +8,8 @@ import pytest
 
 from arm_companion.mission.facts import ArmFault, Bar, Facts, Order, Result, Severity
 from arm_companion.mission.motion import Reference
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, State, Vigil
 from arm_companion.mission.vigil import keep_vigil
 from arm_companion.record_codec import dumps, loads

@@ -26,8 +26,8 @@ from arm_companion.mission.facts import (
 from arm_companion.mission.gripper_facts import GripperAnswer, GripperFate, GripperState, JawState
 from arm_companion.mission.hazards import vehicle_lost
 from arm_companion.mission.notices import WARNINGS
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.perch import TABLE
-from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import MOVES_VEHICLE, Phase
 from arm_companion.record_codec import dumps, loads
 from tests.unit.mission_rig import DT, SETUP, Run, gripping, memory

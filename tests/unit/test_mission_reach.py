@@ -12,8 +12,9 @@ from arm_companion.arm import arc, statics
 from arm_companion.geometry import so3
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result, Setpoint
 from arm_companion.mission.motion import Reference, add, norm, sub
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.reaching import bend_limit, move
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, State, Vigil
 from arm_companion.record_codec import dumps, loads
 from tests.unit.conftest import tendons

@@ -8,7 +8,7 @@ import pytest
 
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.motion import Reference, add
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase, State
 from tests.unit.mission_rig import PLACE, changed, memory, run, tendon, vehicle
 

@@ -16,8 +16,9 @@ from arm_companion.errors import NoSolution
 from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import Bar, Facts, Vec3, WrenchReport
 from arm_companion.mission.motion import norm, rotate
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Anchor, Phase, State
 from arm_companion.mission.wrench import grip
 from tests.unit.mission_rig import BENT, PLACE, T0, Change, gripping, memory, moved, run, tendon, vehicle

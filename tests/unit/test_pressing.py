@@ -10,9 +10,9 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.config import Config
 from arm_companion.mission.facts import Control, Facts, Order
 from arm_companion.mission.motion import Reference
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.pressing import EASED_S
-from arm_companion.mission.situation import Parameters
 from arm_companion.mission.state import PerchKind, Phase, State
 from tests.unit.mission_rig import ANCHOR, BENT, DT, PLACE, Run, memory
 

@@ -8,8 +8,9 @@ import pytest
 
 from arm_companion.mission import pull_test
 from arm_companion.mission.facts import Facts, Order, Vec3
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, pull_test_share
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import PerchKind, Phase
 from tests.unit.mission_rig import PLACE, T0, memory
 

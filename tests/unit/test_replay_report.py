@@ -21,7 +21,7 @@ from arm_companion.config.schema import Config
 from arm_companion.config.table import as_table
 from arm_companion.mission import mission
 from arm_companion.mission.facts import ArmFault
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record import replay as replay_module
 from arm_companion.record import shares

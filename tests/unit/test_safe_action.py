@@ -10,7 +10,7 @@ from arm_companion.app import Daemon
 from arm_companion.clock import Tick
 from arm_companion.mission.facts import ArmAction, Control, Setpoint, VehicleState
 from arm_companion.mission.mission import step
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase
 from tests.unit.conftest import HOVER
 from tests.unit.mission_rig import BENT, T0, memory

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from arm_companion.mission.facts import ArmFault, Control, Facts, Order, Result
-from arm_companion.mission.situation import Parameters
+from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase, Running
 from tests.unit.conftest import tendons
 from tests.unit.mission_rig import DT, PLACE, T0, Change, Run, ask, memory, tendon, vehicle

@@ -8,7 +8,8 @@ import pytest
 
 from arm_companion.mission.facts import Bar, Control, Facts, GraspTarget, WrenchReport, WrenchSource
 from arm_companion.mission.motion import Reference, add
-from arm_companion.mission.situation import Parameters, Situation
+from arm_companion.mission.parameters import Parameters
+from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Prediction, Sharing, State, Vigil
 from arm_companion.mission.vigil import HEAT_MARGIN_K, VOLTAGE_MARGIN_V, keep_vigil
 from tests.unit.mission_rig import (
