@@ -17,19 +17,14 @@ class LinkWatch:
         self._link = link
         self._before = (0.0, 0, 0)  # loop time, bytes sent, bytes received
 
-    def message(self, stamp: int, now: float) -> Message:
-        """LINK_NODE_STATUS.
-
-        Args:
-            stamp: Unix time, us.
-            now: loop time, s.
-        """
+    def message(self, now: float) -> Message:
+        """LINK_NODE_STATUS at the loop time `now`, s, which its time stamp is: MAVLink wants that since boot."""
         link, codec = self._link.counters, self._link.codec.counters
         then, sent, received = self._before
         self._before = (now, link.sent_bytes, link.received_bytes)
         elapsed = max(now - then, 1e-3)
         return mav.MAVLink_link_node_status_message(
-            stamp // 1000,
+            int(now * 1e3),
             0,
             0,
             min(round((link.sent_bytes - sent) / elapsed), _UINT32),

@@ -136,7 +136,7 @@ class Telemetry:
             self._offer(COMPUTER, now, lambda: iter((computer(stamp),)))
         for link in self._links:
             if link.connected and link.streams.take_due(NODE, now):
-                link.send(self._nodes[link.name].message(stamp, now), Priority.BULK)
+                link.send(self._nodes[link.name].message(now), Priority.BULK)
 
     def _offer(self, id_: int, now: float, make: Callable[[], Iterator[Message]]) -> None:
         """Make the messages once, if any link has them due, and send them there."""

@@ -348,7 +348,7 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
         case Phase.APPROACH:
             return s.place(perch.standoff_m), perch.approach_speed_m_per_s
         case Phase.DEPART:
-            return s.standoff, min(perch.approach_speed_m_per_s, s.config.limits.vehicle_speed_m_per_s)
+            return s.standoff, s.speed_back
         case Phase.CONTACT:
             return _clear_of_bar(s), perch.reach_speed_m_per_s
         case Phase.REACH:

@@ -74,6 +74,12 @@ def approach_late(s: Situation) -> str | None:
     return _too_long(perch.state_timeout_s + s.state.way_m / perch.approach_speed_m_per_s, "approach", s)
 
 
+def depart_late(s: Situation) -> str | None:
+    """The same of the way back."""
+    perch = s.config.perch
+    return _too_long(perch.state_timeout_s + perch.standoff_m / s.speed_back, "depart", s)
+
+
 def no_contact(s: Situation) -> str | None:
     """The reach ended, or took too long, without the bar."""
     perch = s.config.perch
@@ -381,7 +387,7 @@ TABLE: Table[Phase, Situation] = Table(
         Row(GRASPING | {Phase.VERIFY}, state_timeout, Phase.UNLOAD, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.UNLOAD}), state_timeout, Phase.RELEASE, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.RELEASE}), state_timeout, Phase.HOLDING, "time limit", ArmFault.TIMEOUT),
-        Row(frozenset({Phase.DEPART}), state_timeout, Phase.STOWING, "time limit", ArmFault.TIMEOUT),
+        Row(frozenset({Phase.DEPART}), depart_late, Phase.STOWING, "time limit", ArmFault.TIMEOUT),
         Row(frozenset({Phase.STOWING}), state_timeout, Phase.HOLDING, "time limit", ArmFault.TIMEOUT),
     ),
     orders=ORDERS,

@@ -270,6 +270,11 @@ class Situation:
         return x, y, place[2] + (0.0 if math.isnan(self.state.load.now) else self.config.grasp.place_search_m)
 
     @property
+    def speed_back(self) -> float:
+        """Of the reference on the way back to the stand-off, m/s."""
+        return min(self.config.perch.approach_speed_m_per_s, self.config.limits.vehicle_speed_m_per_s)
+
+    @property
     def straight_w(self) -> Vec3:
         """Where the straight arm of the hovering vehicle points, world axes: +z of its base, down when below."""
         return turn_by_yaw(column(self.mount.rotation, 2), self.state.heading)

@@ -67,8 +67,9 @@ def test_a_slow_line_carries_what_it_can_the_urgent_first_and_the_newest() -> No
         assert numbers == [0, *range(68, 100)]
         assert link.counters.crowded_out == 67
         assert asyncio.get_running_loop().time() - start > 1.0
-        status = LinkWatch(link).message(10**6, asyncio.get_running_loop().time())
+        status = LinkWatch(link).message(1234.5678)
         assert (status.messages_sent, status.tx_overflows) == (34, 67)
+        assert status.timestamp == 1_234_567, "ms since boot"
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 

@@ -233,6 +233,29 @@ def test_a_bar_at_the_end_of_a_long_way_is_come_to(
     assert state.phase is ends
 
 
+def test_a_slow_way_back_to_a_far_standoff_gets_the_time_that_it_takes(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    config = parameters.config
+    config = dataclasses.replace(
+        config,
+        perch=dataclasses.replace(config.perch, standoff_m=4.0),
+        limits=dataclasses.replace(config.limits, vehicle_speed_m_per_s=0.1),
+    )
+    slow, start = dataclasses.replace(parameters, config=config), (3.0, 0.0, -2.18)
+    state = dataclasses.replace(at(Phase.DEPART, position=start, contact_w=start), reference=Reference(start))
+    for _ in range(450):
+        assert state.phase is Phase.DEPART
+        assert state.reference is not None
+        facts = hovering(position_w=state.reference.position, velocity_w=state.reference.velocity)
+        state, _ = step(state, facts, state.t + 0.1, slow)
+        if state.phase is not Phase.DEPART:
+            break
+    assert state.reference is not None
+    assert state.reference.position == pytest.approx((-1.0, 0.0, -2.18), abs=0.01), "and not where 30 s ended"
+    assert not state.errors & ArmFault.TIMEOUT
+
+
 def test_a_set_point_is_always_complete_and_finite(parameters: Parameters, hovering: Hovering) -> None:
     for phase in Phase:
         _, said = run(at(phase, anchor=ANCHOR), hovering(), parameters, 0.1)
