@@ -20,7 +20,7 @@ from arm_companion.mission.facts import Facts, Order, Request, Result
 from arm_companion.mission.mission import step
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import Phase
-from tests.unit.mission_rig import T0, memory, run
+from tests.unit.mission_rig import T0, gripping, memory, run
 
 LENGTH, RADIUS = 0.25, 0.02
 BELOW = mount((0.0, 0.0, 0.12), (0.0, 0.0, 0.0))
@@ -132,3 +132,13 @@ def test_whatever_was_asked_for_no_command_enters_the_cone(fenced: Parameters, h
     assert keep_out is not None
     assert 3.5 < state.bend[0] < 5.0
     assert 0.0 <= keep_out.clearance(np.asarray(state.bend)) < 0.01
+
+
+@pytest.mark.parametrize(("what", "refused"), [(Order.PERCH, True), (Order.GRASP, True), ("gripper", False)])
+def test_what_wraps_into_the_cone_is_refused_and_a_gripper_wraps_nothing(
+    what: Order | str, refused: bool, fenced: Parameters, hovering: Callable[..., Facts]
+) -> None:
+    flown = gripping(fenced) if what == "gripper" else fenced
+    request = Request(3, Order.GRASP if what == "gripper" else what)  # type: ignore[arg-type]
+    _, said = step(memory(Phase.READY), order(hovering(), request), T0 + 0.01, flown)
+    assert ("inside the keep-out cone" in said.answers[0].reason) is refused

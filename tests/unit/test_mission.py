@@ -233,6 +233,19 @@ def test_a_bar_at_the_end_of_a_long_way_is_come_to(
     assert state.phase is ends
 
 
+@pytest.mark.parametrize(("past", "ends"), [(-0.01, False), (0.0, True)])
+def test_the_bar_is_looked_for_up_to_the_overreach(
+    past: float, ends: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """A bar may be farther than it is told to be, but an arm that meets none goes back."""
+    reaching, perch = at(Phase.REACH), parameters.config.perch
+    place = Situation(reaching, hovering(), 100.0, parameters).place(-perch.overreach_m - past)
+    state = dataclasses.replace(reaching, position=place, reference=Reference(place))
+    state, said = run(state, hovering(position_w=place), parameters)
+    assert state.phase is (Phase.DEPART if ends else Phase.REACH)
+    assert any("no contact 6 cm past where the bar should be" in n.text for c in said for n in c.notices) is ends
+
+
 def test_a_slow_way_back_to_a_far_standoff_gets_the_time_that_it_takes(
     parameters: Parameters, hovering: Hovering
 ) -> None:

@@ -14,7 +14,7 @@ from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.pressing import EASED_S
 from arm_companion.mission.state import PerchKind, Phase, State
-from tests.unit.mission_rig import ANCHOR, BENT, DT, PLACE, Run, memory
+from tests.unit.mission_rig import BENT, DT, PLACE, Run, memory
 
 Hovering = Callable[..., Facts]
 HOVER = 0.5  # share of thrust
@@ -113,10 +113,11 @@ def test_only_a_vehicle_that_stands_on_a_bar_by_its_own_anchor_is_lifted(
 def test_the_way_out_of_a_wrap_begins_no_lower_than_easing_ended(parameters: Parameters, hovering: Hovering) -> None:
     """A step down of 3 cm would press again, with what has just been wound back."""
     raised = Reference((PLACE[0], PLACE[1], PLACE[2] - 0.02), (0.0, 0.0, 0.0), 0.0)
-    run = Run(memory(Phase.RELEASE, reference=raised, anchor=ANCHOR, contact_w=(2.0, 0.0, -2.26)), parameters)
+    wrapped = (parameters.config.perch.wrap_bend_rad, 0.0)
+    run = Run(memory(Phase.RELEASE, reference=raised, bend=wrapped, contact_w=(2.0, 0.0, -2.26)), parameters)
     before = raised.position[2]
     for _ in range(200):
-        run.cycle(hovering(BENT))
+        run.cycle(hovering(run.state.bend))
         assert run.state.reference is not None
         assert run.state.reference.position[2] <= before
         before = run.state.reference.position[2]
