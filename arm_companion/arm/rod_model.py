@@ -23,6 +23,7 @@ LEVELS = ((5, 3, 12), (8, 5, 18), (12, 8, 26))
 
 _NOTHING = Payload(0.0)
 _ZERO = sealed(np.zeros(3))
+_WORTH_A_TRY = 30.0  # of the tolerance, in energy of the modes that a coarser discretisation lacks
 
 
 class RodModel(UnloadedArm):
@@ -192,7 +193,8 @@ class RodModel(UnloadedArm):
     def _would_do(self, level: int, rod: Rod, c: Array) -> bool:
         """Whether this coarser discretisation is worth a try: the modes that it lacks hold next to no energy.
 
-        Next to what varies along the arm: the mean bend is the tendons' own, and hides what loads do.
+        Next to what varies along the arm: the mean bend is the tendons' own, and hides what loads do. Whatever would be
+        accepted is tried, with room to spare: else the way to a load would decide about its last digits.
         """
         if level < 0:
             return False
@@ -200,7 +202,7 @@ class RodModel(UnloadedArm):
         energy = rod.diagonal * c * c
         missed = energy[: 2 * mesh.modes] @ (mesh.degree[: 2 * mesh.modes] > bending)
         missed += energy[2 * mesh.modes :] @ (mesh.degree[2 * mesh.modes :] > twist)
-        return bool(missed < self._tolerance * (energy @ (mesh.degree > 0) + FAINT * rod.moment_scale))
+        return bool(missed < _WORTH_A_TRY * self._tolerance * (energy @ (mesh.degree > 0) + FAINT * rod.moment_scale))
 
     @staticmethod
     def _refined(rod: Rod, finer: Rod, goal: Problem, solved: Solved, imbalance: float) -> Solved:
