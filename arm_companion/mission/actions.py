@@ -53,9 +53,14 @@ _ORDER_OF_RELEASE = (Phase.UNLOAD, Phase.RELEASE, Phase.DEPART, Phase.STOWING, P
 _ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _ORDER_OF_SETTING_DOWN = (Phase.PLACE, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
 _CURLS = (Phase.WRAP, Phase.CLOSE)
+_WITH_CURL = (*_CURLS, Phase.RELEASE)
+_FLIES = frozenset({Phase.APPROACH, Phase.REACH, Phase.CONTACT, Phase.DEPART})
+"""Phases in which nothing holds the vehicle: a change of speed that it is not told of it makes late, and overshoots."""
+
 _WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})
 _NUDGE_M_PER_S = 0.01
-_ACCELERATION = 0.6
+_ACCELERATION = 0.4
+_GENTLY = 0.2
 _YAW_RATE = 0.6
 _FAR_FACTOR = 3.0
 _STILL_FAR_M = 0.5
@@ -210,7 +215,7 @@ def _ahead_of_the_others(s: Situation) -> bool:
     waits: the others open the arm as far as they can.
     """
     reference, phase = s.state.reference, s.state.phase
-    if phase not in (*_CURLS, Phase.RELEASE) or reference is None:
+    if phase not in _WITH_CURL or reference is None:
         return False
     if s.bend_error > _BEND_AHEAD_RAD and s.servo_fault is None:
         return True
@@ -232,8 +237,10 @@ def setpoint(s: Situation) -> Setpoint | None:
     reference = s.state.reference
     if not (s.state.streaming and s.wants_stream and s.facts.vehicle.armed) or reference is None:
         return None
-    path = s.state.lean if s.state.phase in TIP else ZERO
-    return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, path)
+    if s.state.phase in TIP:
+        return Setpoint(reference.position, reference.velocity, s.state.lean, reference.yaw, s.state.lean)
+    path = reference.acceleration if s.state.phase in _FLIES else ZERO
+    return Setpoint(reference.position, reference.velocity, add(path, s.state.lean), reference.yaw, path)
 
 
 def progress(s: Situation) -> int:
@@ -268,20 +275,20 @@ def _reference(s: Situation) -> Reference | None:
     if not state.streaming:
         return state.reference
     if not s.vehicle_fresh:  # frozen, and at rest: acting on old state is worse than waiting
-        return None if state.reference is None else replace(state.reference, velocity=ZERO)
+        return None if state.reference is None else state.reference.still
     if not (s.external and s.wants_stream):
         return _here(s)
     reference = state.reference or _here(s)
     if state.phase in _REFERENCE_RESTS:
         if astray(s) is not None:
             return _here(s)  # a vehicle that follows again stays where it is
-        return replace(reference, velocity=ZERO)
+        return reference.still
     if state.phase in SHARING:
         return hung_reference(s, reference)
-    if state.phase in (*_CURLS, Phase.RELEASE):
+    if state.phase in _WITH_CURL:
         beside = _beside_bar(s)
         if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(beside)):
-            return replace(reference, velocity=ZERO)  # nobody knows where the bar was met
+            return reference.still  # nobody knows where the bar was met
         return Reference(pressing.not_back_down(s, beside, reference.position), ZERO, state.heading)
     goal, speed = _goal(s)
     # an arm that is wrapped is not turned in by a heading of another place: after a restart nobody knows the bar's
@@ -291,7 +298,7 @@ def _reference(s: Situation) -> Reference | None:
         goal,
         reference.yaw if keeps else state.heading,
         speed=speed,
-        acceleration=_ACCELERATION,
+        acceleration=_GENTLY if state.phase in (Phase.REACH, Phase.CONTACT) else _ACCELERATION,
         yaw_rate=_YAW_RATE,
         dt=s.dt,
     )

@@ -10,11 +10,24 @@ ZERO: Vec3 = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Reference:
-    """Where the vehicle is asked to be, world axes (NED)."""
+    """Where the vehicle is asked to be, world axes (NED).
+
+    Attributes:
+        position: m.
+        velocity: m/s.
+        yaw: rad.
+        acceleration: m/s^2, of the velocity.
+    """
 
     position: Vec3
     velocity: Vec3 = ZERO
     yaw: float = 0.0
+    acceleration: Vec3 = ZERO
+
+    @property
+    def still(self) -> "Reference":
+        """The same place, at rest."""
+        return Reference(self.position, ZERO, self.yaw)
 
 
 def add(a: Vec3, b: Vec3) -> Vec3:
@@ -87,7 +100,7 @@ def follow(
     velocity = add(reference.velocity, change)
     if distance <= acceleration * dt * dt and norm(reference.velocity) <= acceleration * dt * (1.0 + 1e-9):
         return Reference(goal, ZERO, yaw_now)
-    return Reference(add(reference.position, scale(velocity, dt)), velocity, yaw_now)
+    return Reference(add(reference.position, scale(velocity, dt)), velocity, yaw_now, scale(change, 1.0 / dt))
 
 
 def arrived(reference: Reference, goal: Vec3) -> bool:

@@ -4,8 +4,8 @@ import math
 
 from arm_companion.mission.facts import TendonState, Vec3
 from arm_companion.mission.gripper_facts import JawState
-from arm_companion.mission.motion import add, norm, scale, sub
-from arm_companion.mission.situation import Situation
+from arm_companion.mission.motion import ZERO, add, norm, scale, sub
+from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import FOLLOWS, State
 from arm_companion.values import replace
 
@@ -20,6 +20,7 @@ _GAP_S = 1.0  # without a fresh position, after which the vehicle may be anywher
 _BURST_M_PER_S2 = 0.75  # a quarter of the acceleration with which a hover ends and another begins unseen
 _JUMPS = 8  # that are remembered one by one
 _AWAY_S = 3.0
+_RESTS_M = 0.02
 _ASTRAY_M = 0.5  # the reference moves at half a metre a second, and a multirotor lags it by less than a second
 
 
@@ -61,6 +62,7 @@ def keep_vigil(s: Situation) -> State:
         tight_s=time(before.tight_s, holds=any(t.tension > limits.tension_max_n for t in heard)),
         blind_s=time(before.blind_s, holds=_blind(s)),
         unheard_s=time(before.unheard_s, holds=not s.heard),
+        rested_s=time(before.rested_s, holds=_rests(s)),
     )
     return replace(state, vigil=vigil)
 
@@ -77,6 +79,14 @@ def _astray(s: Situation) -> bool:
     if s.state.phase not in FOLLOWS or reference is None or not (s.external and s.vehicle_fresh):
         return False
     return norm(sub(reference.position, s.facts.vehicle.position_w)) > _ASTRAY_M
+
+
+def _rests(s: Situation) -> bool:
+    """Whether the vehicle is where a reference is that rests itself."""
+    reference = s.state.reference
+    if reference is None or reference.velocity != ZERO or not s.vehicle_fresh:
+        return False
+    return at(s, reference.position, _RESTS_M)
 
 
 def _blind(s: Situation) -> bool:

@@ -23,7 +23,7 @@ from arm_companion.mission.facts import (
     WrenchSource,
 )
 from arm_companion.mission.mission import step
-from arm_companion.mission.motion import Reference
+from arm_companion.mission.motion import ZERO, Reference, norm
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import NO_LOAD, Flow, Load, ThrustCurve
 from arm_companion.mission.situation import Situation
@@ -97,6 +97,53 @@ def test_perch_is_refused_with_the_reason(
     (answer,) = answers(said)
     assert answer.result is Result.TEMPORARILY_REJECTED
     assert words in answer.reason
+
+
+@pytest.mark.parametrize("phase", [Phase.APPROACH, Phase.DEPART, Phase.REACH, Phase.CONTACT])
+def test_on_a_way_set_points_have_the_acceleration_of_their_path(
+    parameters: Parameters, hovering: Hovering, phase: Phase
+) -> None:
+    """Whoever is not told that the way ends brakes by himself, behind its end."""
+    state, said = run(at(phase, contact_w=(2.942, 0.0, -2.18)), hovering(), parameters, 0.2)
+    sent = [commands.setpoint for commands in said if commands.setpoint is not None]
+    assert len(sent) > 10
+    assert norm(sent[-1].velocity_w) > 0.02, "it has begun to fly"
+    assert max(norm(setpoint.acceleration_w) for setpoint in sent) > 0.15
+    assert all(setpoint.acceleration_w == setpoint.path_w for setpoint in sent), "none of it is a force"
+    state, said = run(state, hovering(position_age_s=0.4), parameters)
+    (frozen,) = [commands.setpoint for commands in said]
+    assert frozen is not None
+    assert (frozen.velocity_w, frozen.acceleration_w, frozen.path_w) == (ZERO, ZERO, ZERO), "an old state moves nothing"
+
+
+def test_an_arm_is_wrapped_only_once_the_vehicle_rests_beside_the_bar(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    """The blow of the bar throws it back and forth: 2 cm off and slow is also where it passes by, or turns round."""
+    clear = parameters.config.perch.wrap_clearance_m
+    state = dataclasses.replace(at(Phase.CONTACT, contact_w=(2.0 + clear, 0.0, -2.2)), since=100.0)
+    there = hovering()
+    state, _ = run(state, there, parameters, 2.4)
+    assert state.phase is Phase.CONTACT
+    for _ in range(3):
+        state, _ = run(state, hovering(position_w=(2.025, 0.0, -2.2)), parameters, 0.4)
+        assert state.phase is Phase.CONTACT, "not near enough"
+        state, _ = run(state, hovering(velocity_w=(0.025, 0.0, 0.0)), parameters, 0.4)
+        assert state.phase is Phase.CONTACT, "not slow enough"
+        state, _ = run(state, there, parameters, 0.4)
+        assert state.phase is Phase.CONTACT, "not for long enough"
+    state, _ = run(state, there, parameters, 0.15)
+    assert state.phase is Phase.WRAP
+
+
+def test_a_vehicle_that_never_quite_rests_wraps_all_the_same(parameters: Parameters, hovering: Hovering) -> None:
+    clear = parameters.config.perch.wrap_clearance_m
+    state = dataclasses.replace(at(Phase.CONTACT, contact_w=(2.0 + clear, 0.0, -2.2)), since=100.0)
+    restless = hovering(position_w=(2.025, 0.0, -2.2))
+    state, _ = run(state, restless, parameters, 7.8)
+    assert state.phase is Phase.CONTACT
+    state, _ = run(state, restless, parameters, 0.4)
+    assert state.phase is Phase.WRAP
 
 
 @pytest.mark.parametrize("phase", [Phase.STOWED, Phase.APPROACH, Phase.PERCHED, Phase.HOLDING])
@@ -209,7 +256,7 @@ def test_an_approach_that_is_given_up_far_away_brings_the_vehicle_no_nearer(
     assert state.phase is Phase.STOWED
     assert state.reference is not None
     way = state.reference.position[0] - begin.position[0]
-    assert way == pytest.approx(0.13 if stays else left_m, abs=0.06)
+    assert way == pytest.approx(0.2 if stays else left_m, abs=0.06)
 
 
 @pytest.mark.parametrize(("follows", "ends"), [(True, Phase.REACH), (False, Phase.STOWED)])

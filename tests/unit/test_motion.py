@@ -9,10 +9,12 @@ from hypothesis import strategies as st
 from arm_companion.mission.motion import (
     ZERO,
     Reference,
+    add,
     arrived,
     follow,
     norm,
     rotate,
+    scale,
     sub,
     unrotate,
     wrap_angle,
@@ -66,6 +68,31 @@ def test_a_reference_that_is_already_moving_still_arrives(
         if arrived(reference, goal):
             break
     assert arrived(reference, goal)
+
+
+@settings(max_examples=40, deadline=None)
+@given(points, points, points, st.floats(0.02, 2.0), st.floats(0.1, 3.0))
+def test_position_velocity_and_acceleration_of_a_reference_belong_to_each_other(
+    start: tuple[float, float, float],
+    velocity: tuple[float, float, float],
+    goal: tuple[float, float, float],
+    speed: float,
+    acceleration: float,
+) -> None:
+    """Whoever follows a set-point takes each for the slope of the one before; and it ends with the way."""
+    reference = Reference(start, velocity)
+    for _ in range(2_000):
+        before = reference
+        reference = follow(reference, goal, 0.0, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=DT)
+        assert norm(reference.acceleration) <= acceleration * (1.0 + 1e-9)
+        if arrived(reference, goal):
+            break
+        assert add(before.velocity, scale(reference.acceleration, DT)) == pytest.approx(reference.velocity, abs=1e-9)
+        assert add(before.position, scale(reference.velocity, DT)) == pytest.approx(reference.position, abs=1e-9)
+    still = follow(reference, goal, 0.0, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=DT)
+    if arrived(reference, goal):
+        assert still.acceleration == ZERO
+    assert reference.still == Reference(reference.position, ZERO, reference.yaw)
 
 
 @given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda q: math.hypot(*q) > 0.1), points)
