@@ -359,7 +359,8 @@ class ServoBus:
         """Bring back what can be brought back, at the word of somebody who sees the arm hang straight.
 
         Servos with a hardware error are rebooted, watchdog trips cleared, and servos that lost their turns
-        accepted near their zeros. One that is well is not touched. All are tried whatever happens to one.
+        accepted near their zeros, or where they stood without torque before the reboot. One that is well is not
+        touched. All are tried whatever happens to one.
 
         Raises:
             ExceptionGroup: of one `DeviceFault` for each servo that could not be brought back.
@@ -367,13 +368,16 @@ class ServoBus:
         await self._for_each("recover", self._records, self._recover)
 
     async def _recover(self, record: ServoRecord) -> None:
+        near: int | None = None
         if record.error_bits:
+            if record.feedback is not None and not (record.turns_lost or record.torque):
+                near = record.feedback.position  # its tendon may be slack, more than a turn from its zero
             await self.reboot(record.id)
             await self._await_boot(record)
         if record.tripped or not record.set_up:
             await self._set_up(record)
         if record.turns_lost:
-            await self.accept_position(record.id)
+            await self.accept_position(record.id, near)
 
     async def _await_boot(self, record: ServoRecord) -> None:
         """Return once a servo answers again, or after as long as that may take."""

@@ -196,6 +196,22 @@ def test_a_servo_that_overheats_shuts_down_and_comes_back_only_when_it_has_coole
     story(play)
 
 
+@pytest.mark.parametrize("away", [-5000, 5000])
+def test_a_servo_that_shut_down_more_than_a_turn_from_its_zero_is_found_where_it_stood(away: int) -> None:
+    async def play(arm: Arm) -> None:
+        await arm.run(4.0, HOME + away)
+        arm.emulator[4].trip(HardwareError.OVERLOAD)
+        await arm.run(0.2, HOME + away)
+        assert arm.faults() == {4: HardwareError.OVERLOAD}
+        await arm.meanwhile(arm.bus.recover(), HOME + away)
+        await arm.run(0.5, HOME + away)
+        assert arm.faults() == {}
+        assert arm.at(HOME + away, ALL), "a turn nearer to its zero, it would have wound its tendon by that turn"
+        assert arm.states[3].position == pytest.approx(HOME + away, abs=20)
+
+    story(play)
+
+
 def test_a_servo_that_restarts_by_itself_is_not_believed_and_the_others_go_on() -> None:
     async def play(arm: Arm) -> None:
         arm.emulator[4].reboot()
