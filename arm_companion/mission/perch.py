@@ -28,7 +28,7 @@ from arm_companion.mission.hazards import (
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, norm, sub
 from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, tested_to_hang
-from arm_companion.mission.refusals import cannot_set_out
+from arm_companion.mission.refusals import cannot_clear, cannot_set_out
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import CARRYING, PerchKind, Phase
 
@@ -270,6 +270,7 @@ ORDERS: tuple[Ask, ...] = (
     # servos may be rebooted and homed only where nothing hangs on them; `done` is when they are well
     Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset()),
     Ask(Order.CLEAR_ERRORS, STOWED_ONLY, Phase.STOWED, frozenset()),
+    Ask(Order.CLEAR_ERRORS, frozenset({Phase.HOLDING}), Phase.STOWED, frozenset(), cannot_clear),
     *(Ask(Order.FEEDFORWARD, frozenset({phase}), phase, frozenset({phase})) for phase in Phase),
     *(
         # nothing is under way that could be given up, or it is being given up already

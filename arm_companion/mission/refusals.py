@@ -1,5 +1,7 @@
-"""Why the vehicle cannot set out for a bar or an object now."""
+"""Why the vehicle cannot set out for a bar or an object now, and why an arm that holds cannot be cleared."""
 
+from arm_companion.mission import gripper
+from arm_companion.mission.calibrating import vehicle_arms, vehicle_silent
 from arm_companion.mission.facts import Bar
 from arm_companion.mission.hazards import hot, low_voltage, vehicle_lost
 from arm_companion.mission.motion import norm, sub
@@ -7,6 +9,7 @@ from arm_companion.mission.situation import Situation
 
 _WITHIN_M = 50.0
 _LEVEL = 0.2  # sine of the steepest axis that an upright vehicle can wrap
+_LET_OUT_RAD = 0.25  # bend that a tendon's displacement stands for, up to which the arm is clear of what it held
 
 
 def cannot_set_out(s: Situation, target: Bar, name: str, *, wraps: bool = True) -> str | None:
@@ -31,3 +34,25 @@ def _wraps_into_keep_out(s: Situation) -> str | None:
     """The full wrap would take the arm where propellers or landing gear are: a matter of the configuration."""
     depth = -s.parameters.wrap_clearance
     return f"the full wrap is {depth * 100:.1f} cm inside the keep-out cone" if depth > 0.0 else None
+
+
+def cannot_clear(s: Situation) -> str | None:
+    """Why the servos of an arm that was left holding cannot be brought back now.
+
+    A vehicle whose motors were stopped at a bar may hang by its arm, although the autopilot says that it stands. So
+    nothing may hold any more: what has torque stands where the straight arm has it. Of a silent servo its last word
+    counts.
+    """
+    if s.arm_above:
+        return "an arm above may carry the vehicle"
+    if (reason := vehicle_silent(s) or vehicle_arms(s)) is not None:
+        return reason
+    most = _LET_OUT_RAD * s.parameters.model.parameters.r
+    holding = [
+        f"tendon {i + 1}" for i, t in enumerate(s.facts.tendons) if t.torque and not (t.homed and abs(t.pull) <= most)
+    ]
+    if s.jaws is not None and s.jaws.torque and not gripper.is_open(s):
+        holding.append("gripper")
+    if not holding:
+        return None
+    return f"{holding[0]} holds, or may hold: RELEASE; if it still does, take the servos' power away for a moment"
