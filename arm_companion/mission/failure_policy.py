@@ -118,6 +118,12 @@ CAUSES: tuple[Cause, ...] = (
         (hazards.servo_fault,),
         "goes on with the others; READY is refused",
     ),
+    Cause(
+        "servo without torque",
+        ArmFault.SERVO_FAULT,
+        (hazards.servo_limp,),
+        "not judged: the torque comes on with what is done next, or need not be on",
+    ),
     Cause("servo overheats (warning)", ArmFault.OVERHEAT, (hazards.hot,), "nothing"),
     Cause(
         "servo overloaded",

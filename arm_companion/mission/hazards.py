@@ -63,6 +63,12 @@ def servo_fault(s: Situation) -> str | None:
     return s.servo_fault
 
 
+def servo_limp(s: Situation) -> str | None:
+    """A tendon's servo that is well has no torque: asked in phases alone in which all of them hold or move the arm."""
+    limp = next((i for i, tendon in enumerate(s.facts.tendons) if not tendon.torque), None)
+    return None if limp is None or s.servo_fault is not None else f"tendon {limp + 1}: servo has no torque"
+
+
 def unheard_at_start(s: Situation) -> str | None:
     """What the arm does now is not known, because a servo stays silent that the daemon waits for at its start."""
     if s.state.vigil.unheard_s <= _UNHEARD_S:

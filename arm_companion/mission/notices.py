@@ -15,6 +15,7 @@ from arm_companion.mission.hazards import (
     overstressed,
     pilot_takes_over,
     servo_fault,
+    servo_limp,
     slack,
     tendon_broken,
     tendon_jumped,
@@ -39,6 +40,7 @@ WARNINGS: tuple[Told, ...] = (
         "the arm is left as it is, and nothing is possible before it is heard",
     ),
     Told(TENSE, servo_fault, Severity.CRITICAL, "the arm holds"),
+    Told(TENSE, servo_limp, Severity.CRITICAL, "the others hold", ArmFault.SERVO_FAULT),
     *(
         Told(GRIPPED | CARRYING | {Phase.HOLDING}, guard, Severity.CRITICAL, "the arm holds")
         for guard in (tendon_broken, tendon_jumped)
@@ -68,7 +70,7 @@ WARNINGS: tuple[Told, ...] = (
             Severity.CRITICAL,
             "the arm holds and cannot let go: let the motors carry the vehicle while it still can",
         )
-        for guard in (servo_fault, tendon_broken, tendon_jumped, hot, low_voltage, overstressed)
+        for guard in (servo_fault, servo_limp, tendon_broken, tendon_jumped, hot, low_voltage, overstressed)
     ),
     Told(
         frozenset({Phase.HANG_HOLD}),

@@ -20,6 +20,7 @@ from arm_companion.mission.hazards import (
     overstressed,
     pilot_takes_over,
     servo_fault,
+    servo_limp,
     tendon_broken,
     tendon_jumped,
     vehicle_lost,
@@ -337,6 +338,10 @@ TABLE: Table[Phase, Situation] = Table(
                 (tendon_jumped, "tendon jumped", ArmFault.TENSION_DISAGREES),
             )
             for phases, target in (*_ENDS_A_BEGINNING, (frozenset({Phase.READYING, Phase.READY}), Phase.STOWING))
+        ),
+        *(
+            Row(phases, servo_limp, target, "no torque", ArmFault.SERVO_FAULT)
+            for phases, target in (*_ENDS_A_BEGINNING, (frozenset({Phase.READY}), Phase.STOWING))
         ),
         *(
             Row(phases, guard, target, name, error)

@@ -177,6 +177,7 @@ PROVOCATIONS: dict[str, Provocation] = {
     "operator aborts": Provocation("order ABORT", lambda f: ask(f, Order.ABORT)),
     "servo silent": Provocation("does not answer", tendon(2, silent=True)),
     "servo hardware error": Provocation("hardware error 0x04", tendon(1, error_bits=0x04)),
+    "servo without torque": Provocation("servo has no torque", tendon(1, torque=False)),
     "servo overheats (warning)": Provocation("servo at 70 degC", tendon(0, temperature=70.0), seconds=1.2),
     "servo overloaded": Provocation("hardware error 0x20", tendon(1, error_bits=0x20)),
     "low voltage": Provocation("servo supply 9.7 V", tendon(3, voltage=9.7), seconds=1.2),
