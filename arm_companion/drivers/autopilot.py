@@ -335,8 +335,8 @@ class Autopilot:
         return now if at is None or abs(now - at) > _SAME_CLOCK_S else min(now, at)
 
     def _arrival(self, id_: int, boot_ms: int) -> bool:
-        """Count a state message and see whether the autopilot has booted anew; False for a late one."""
-        last = self._boot_ms.get(id_, boot_ms)
+        """Count a state message and see whether the autopilot has booted anew; False for a late one, or a repeated."""
+        last = self._boot_ms.get(id_, -1)
         if boot_ms < last - _REBOOT_BACK_MS:
             log.warning("the autopilot has rebooted; asking for its state again")
             self.counters.reboots += 1
@@ -344,7 +344,7 @@ class Autopilot:
             self._check_now.set()
             if self._timesync is not None:
                 self._timesync.forget()
-        elif boot_ms < last:
+        elif boot_ms <= last:
             return False
         self._boot_ms[id_] = boot_ms
         self._arrived[id_] += 1

@@ -261,6 +261,25 @@ def test_a_late_frame_does_not_turn_back_time(fly: Callable[..., None]) -> None:
     fly(body)
 
 
+def test_a_frame_that_comes_again_says_nothing_new(fly: Callable[..., None]) -> None:
+    """A router, or a second link, that repeats the last frame of an autopilot that has stopped."""
+
+    async def body(rig: Rig) -> None:
+        await rig.stream(0.5)
+        assert rig.state.position_age_s < 0.02
+        rig.asked()
+        for _ in range(300):
+            rig.attitude(1.0, 0.0, 0.0, 0.0)
+            rig.position(1.0, 2.0, 3.0, 0.0, 0.0, 0.0)
+            rig.thrust(0.5)
+            await asyncio.sleep(0.01)
+        assert min(rig.state.position_age_s, rig.state.attitude_age_s) > 2.9
+        assert math.isnan(rig.state.thrust)
+        assert {31, 32, 83} <= rig.asked().keys(), "nothing flows, so it is asked for again"
+
+    fly(body)
+
+
 # --- rates ---
 
 
