@@ -76,6 +76,9 @@ class ServoLink:
         self._fast = False
         self._answers: dict[int, Packet] = {}
         self._owed: dict[int, float] = {}  # when an answer that has not come should have ended
+        self._late_until: dict[int, float] = {}  # until when answers to earlier requests may come
+        self._possible: dict[int, float] = {}  # before which no answer to the present request can have come
+        self._forestalled: set[int] = set()  # whose late answer was dropped since the present request
 
     @property
     def connected(self) -> bool:
@@ -105,7 +108,7 @@ class ServoLink:
                 self._take_fast(packet)
                 continue
             fits = len(packet.parameters) == self._size or packet.error & ~dxl.ALERT
-            if self._waiting is None or packet.id not in self._wanted or not fits:
+            if self._waiting is None or packet.id not in self._wanted or not fits or self._forestalls(packet.id):
                 self.strays += 1
                 self._learn_from_late(packet.id)
                 continue
@@ -120,8 +123,11 @@ class ServoLink:
             answers = dxl.split_fast_sync_answer(packet, self._size) if self._fast and self._waiting else []
         except ProtocolError:
             answers = []
-        if [answer.id for answer in answers] != list(self._wanted):
+        late = [answer.id for answer in answers if self._forestalls(answer.id)]
+        if late or [answer.id for answer in answers] != list(self._wanted):
             self.strays += 1
+            for servo in late:
+                self._learn_from_late(servo)
             return
         self._answers = {answer.id: answer for answer in answers}
         self._finish()
@@ -149,8 +155,9 @@ class ServoLink:
         async with self._lock:
             loop = asyncio.get_running_loop()
             begin = loop.time()
-            answer = dxl.fast_sync_size(len(servos), size) if fast else len(servos) * (size + dxl.STATUS_OVERHEAD)
-            wire = self._end_of_line(begin, len(request) + answer)
+            each = size + dxl.STATUS_OVERHEAD
+            ends = [dxl.fast_sync_size(len(servos), size) if fast else (i + 1) * each for i in range(len(servos))]
+            wire = self._end_of_line(begin, len(request) + max(ends, default=0))
             for servo in servos:
                 wire += self._return_delays.get(servo, 0.0) + _TURNAROUND_S
             if self._transport is None or not servos or wire > deadline:
@@ -159,6 +166,10 @@ class ServoLink:
                 return {}
             self.parser.reset()
             self._wanted, self._size, self._fast, self._answers = servos, size, fast, {}
+            self._forestalled.clear()
+            if self._late_until:
+                line = self._end_of_line(begin, len(request))
+                self._possible = {s: line + end * self._byte_s for s, end in zip(servos, ends, strict=True)}
             self._waiting = loop.create_future()
             self._transport.write(request)
             timer = loop.call_at(min(wire + self.latency.margin_s, deadline), self._finish)
@@ -175,7 +186,9 @@ class ServoLink:
                 for servo in servos:
                     self._owed.pop(servo, None)
             else:
-                self._owed |= {servo: wire for servo in servos if servo not in self._answers}
+                silent = [s for s in servos if s not in self._answers and s not in self._forestalled]
+                self._owed |= dict.fromkeys(silent, wire)
+                self._late_until |= dict.fromkeys(silent, wire + DRAIN_S)
             return self._answers
 
     async def tell(self, request: bytes) -> None:
@@ -233,6 +246,19 @@ class ServoLink:
     def _owes(self, servo: int) -> bool:
         """Whether the answer to an earlier request may still come."""
         return asyncio.get_running_loop().time() - self._owed.get(servo, -math.inf) < DRAIN_S
+
+    def _forestalls(self, servo: int) -> bool:
+        """Whether an answer is to an earlier request: one may still come, and the present one's cannot be here yet.
+
+        Taken for the present one's, that of the last servo would end a Sync Read while the others are talking. Requests
+        that nothing but such answers come to are no reason to go on so: where the wire is faster than it is said to
+        be, each answer looks like that.
+        """
+        until = self._late_until.get(servo)
+        if until is None or not asyncio.get_running_loop().time() < min(until, self._possible.get(servo, -math.inf)):
+            return False
+        self._forestalled.add(servo)
+        return True
 
     def _learn_from_late(self, servo: int) -> None:
         due = self._owed.pop(servo, None)

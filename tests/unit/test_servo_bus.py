@@ -16,7 +16,7 @@ from arm_companion.clock import precise_loop, run_simulated, ticks
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.drivers.servo_health import ServoState
-from arm_companion.drivers.servo_link import ServoLink
+from arm_companion.drivers.servo_link import DRAIN_S, ServoLink
 from arm_companion.errors import DeviceFault, LinkError
 from arm_companion.protocol import control_table as ct
 from arm_companion.protocol import dynamixel as dxl
@@ -525,6 +525,72 @@ def test_the_late_answer_to_another_question_is_not_believed() -> None:
             assert await link.read(2, ct.LED) == ct.LED.address
             assert not await asking
             assert await link.read(2, ct.TORQUE_ENABLE) == ct.TORQUE_ENABLE.address
+
+    run_simulated(main())
+
+
+def hold_back(rig: Rig, late: float, firmware: int) -> Callable[[bool], None]:
+    """Make the adapter bring the last servo's answers late, or one of all; whoever gets this switches it on and off."""
+    held = [False]
+    loop = asyncio.get_running_loop()
+
+    def to_master(data: bytes) -> bytes:
+        if not held[0]:
+            return data
+        now = b""
+        for packet in dxl.Parser().feed(data):
+            frame = dxl.status(packet.id, packet.error, packet.parameters)
+            if packet.id == rig.config.ids[-1] or packet.id == dxl.BROADCAST_ID:
+                loop.call_later(late, rig.bus._link.receive, data if firmware > 44 else frame)
+            else:
+                now += frame
+        return now
+
+    def switch(on: bool) -> None:
+        held[0] = on
+
+    rig.wire.to_master = to_master
+    return switch
+
+
+@pytest.mark.parametrize("late", [0.004, 0.0095])
+@pytest.mark.parametrize("firmware", [42, 52], ids=["Sync Read", "Fast Sync Read"])
+def test_late_answers_to_the_cycle_before_do_not_end_this_ones_read(firmware: int, late: float) -> None:
+    """It would end while the other servos are talking, and they would be asked again, one by one, meanwhile."""
+
+    def prepare(rig: Rig) -> None:
+        for servo in rig.emulator.servos:
+            servo.poke(ct.FIRMWARE_VERSION, firmware)
+
+    async def story(rig: Rig) -> None:
+        await rig.bus.start()
+        await rig.cycles(20)
+        hold = hold_back(rig, late, firmware)
+        hold(True)
+        await rig.cycles(1)
+        hold(False)
+        rig.sent.clear()
+        begin = asyncio.get_running_loop().time()
+        states = await rig.bus.read()
+        assert asyncio.get_running_loop().time() - begin > 0.0014, "as long as four answers take"
+        assert [p.instruction for p in rig.sent if p.instruction == dxl.Instruction.READ] == []
+        assert rig.bus._link.strays > 0
+        assert all(state.age_s < 0.002 for state in states)
+
+    scenario(story, prepare=prepare)
+
+
+def test_on_a_wire_that_is_faster_than_it_is_said_to_be_servos_are_heard_again_soon() -> None:
+    """A bridge may speak to the servos at another speed: each answer comes sooner than it could here."""
+
+    async def main() -> None:
+        link = ServoLink(9600, 0.05)
+        link.attach(cast("Transport", LateServo(link)))
+        loop = asyncio.get_running_loop()
+        link._late_until[2] = loop.time() + DRAIN_S
+        read = dxl.read(2, ct.LED.address, 1)
+        heard = [bool(await link.ask(read, (2,), 1, loop.time() + 0.05)) for _ in range(4)]
+        assert heard == [False, True, True, True]
 
     run_simulated(main())
 
