@@ -107,6 +107,8 @@ def prepare(s: Situation) -> State:
         case Phase.LIFT:  # what the object weighs is found anew
             load = replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0)
             return replace(state, offset=ZERO, load=load)
+        case Phase.PLACE:
+            return replace(state, way_m=_way_down(s))
         case Phase.RELEASE if state.anchor is not None:  # of a closed arm, wherever that is: out as it came in
             closed = state.position  # where it rests on the object, and not where it was asked to sink to
             arc = 0.0 if s.gripping else s.config.perch.contact_arc_m
@@ -142,6 +144,14 @@ def goal(s: Situation) -> tuple[Vec3, float]:
         )
     share = _SLOWLY if s.probe[2] - here[2] < _NEAR_GROUND_M else 1.0
     return down, share * grasp.lift_speed_m_per_s
+
+
+def _way_down(s: Situation) -> float:
+    """Way of setting down, m; the last of it, flown slowly, for as much as it takes."""
+    reference, down = s.state.reference, s.setting_down
+    x, y, z = sub(down, s.facts.vehicle.position_w if reference is None else reference.position)
+    slow = _NEAR_GROUND_M + down[2] - s.probe[2]
+    return math.hypot(x, y) + max(z, 0.0) + slow * (1.0 / _SLOWLY - 1.0)
 
 
 def _touching_down(s: Situation) -> bool:

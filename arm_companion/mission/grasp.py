@@ -100,10 +100,11 @@ def nothing_below(s: Situation) -> str | None:
 
 
 def takes_too_long(s: Situation) -> str | None:
-    """Lifting or setting down lasts longer than its way needs."""
+    """Lifting or setting down lasts longer than its way needs; a pilot may have climbed far above the pick-up."""
     grasp = s.config.grasp
-    limit = s.config.perch.state_timeout_s + grasp.lift_height_m / grasp.lift_speed_m_per_s
-    return f"{s.state.phase.name.lower()} took more than {limit:g} s" if s.elapsed > limit else None
+    way = s.state.way_m if s.state.phase is Phase.PLACE else grasp.lift_height_m
+    limit = s.config.perch.state_timeout_s + way / grasp.lift_speed_m_per_s
+    return f"{s.state.phase.name.lower()} took more than {limit:.0f} s" if s.elapsed > limit else None
 
 
 # --- guards: what goes well ---

@@ -251,7 +251,7 @@ class State:
     t: float = 0.0  # loop time of the previous step
     running: Running | None = None
     task: Order = Order.PERCH  # what the arm reaches out for: PERCH or GRASP
-    way_m: float = 0.0  # to the stand-off when the last approach began
+    way_m: float = 0.0  # of the last approach, or of setting a load down, when it began
     tries: int = 0  # approaches since it was ordered
     control: Control = Control.UNKNOWN  # of the previous step, to see the pilot take over
     armed: bool = False  # of the previous step, to see the motors stop

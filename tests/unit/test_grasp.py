@@ -359,6 +359,32 @@ def test_with_nothing_below_the_load_is_kept(parameters: Parameters, hovering: H
     assert not opened(run.said)
 
 
+@pytest.mark.parametrize("up", [0.4, 6.0])
+def test_setting_down_has_the_time_that_the_way_down_takes(
+    up: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.CARRY, up=up), parameters)
+    commands = run.cycle(ask(aloft(hovering, up=up), Order.RELEASE))
+    high = up
+    for _ in range(round(100.0 * (up + 5.0) / parameters.config.grasp.lift_speed_m_per_s)):
+        if commands.setpoint is None or run.state.phase is not Phase.PLACE:
+            break
+        high = PLACE[2] - commands.setpoint.position_w[2]
+        commands = run.cycle(aloft(hovering, MASS if high > 0.0 else 0.0, high))
+    assert run.phases == [Phase.CARRY, Phase.PLACE, Phase.RELEASE]
+
+
+def test_a_vehicle_that_does_not_come_down_keeps_its_load_after_a_while(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.CARRY, up=0.4), parameters)
+    run.cycle(ask(aloft(hovering), Order.RELEASE))
+    run.state = dataclasses.replace(run.state, since=run.state.since - 50.0)
+    run.cycle(aloft(hovering))
+    assert run.phases == [Phase.CARRY, Phase.PLACE, Phase.CARRY]
+    assert run.state.errors & ArmFault.TIMEOUT
+
+
 def test_without_a_thrust_it_is_set_down_at_the_height_of_the_pick_up(
     parameters: Parameters, hovering: Hovering
 ) -> None:
