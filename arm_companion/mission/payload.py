@@ -48,6 +48,7 @@ _PRIOR_SLOPE = 1.25  # of the curve at hover, over that of a straight line throu
 _PRIOR_SIGMA = (1.0, 0.35, 0.1, 0.003)  # of a, m/s^2; the slope, in the same terms; the drag; a's fall, m/s^3
 _FALL_DRIFT = 1e-4  # m/s^3 per root second
 _LEAST_SHARE = 0.05  # rotors that idle say nothing
+_IDLE = 0.6  # of the hover's thrust, under which something else holds the vehicle up
 _CLIMB_M_PER_S = (
     0.15  # by which a take-off is known: PX4 says that it flies while its rotors still spin up on the ground
 )
@@ -110,8 +111,9 @@ class ThrustCurve:
 
     @property
     def gain_sigma(self) -> float:
-        """One sigma of `gain`, which its slope is almost all of."""
-        return math.sqrt(self.covariance[1][1]) * self.at / GRAVITY
+        """One sigma of `gain`, which its slope is almost all of, unless a has not been seen for long."""
+        P, at = self.covariance, self.at
+        return math.sqrt(max(at * at * P[1][1] - 2.0 * at * P[0][1] + P[0][0], 0.0)) / GRAVITY
 
     @property
     def gain(self) -> float:
@@ -283,7 +285,9 @@ def watch_load(
     if lifted is not None:
         curve = (curve or ThrustCurve.prior(flow.push / flow.up)).learn(flow, felt * (1.0 + lifted / mass), dt)
     elif curve is not None:
-        curve = curve.ahead(dt)
+        asked = flow.push / flow.up / curve.at
+        # rotors empty the battery with their power: a vehicle that hangs for an hour has not flown for one
+        curve = curve.ahead(dt if asked > _IDLE else dt * asked**1.5)
     now = math.nan if curve is None else mass * (curve.lift(flow) / max(felt, 0.3 * GRAVITY) - 1.0)
     return replace(old, curve=curve, flow=flow, seen_s=seen_s, now=now)
 

@@ -193,6 +193,23 @@ def test_the_battery_goes_on_emptying_while_something_is_held_and_nothing_can_be
     assert abs(np.mean(seen)) < 2.0 * load.sigma_now(MASS)
 
 
+@pytest.mark.parametrize("seed", range(1, 4))
+@pytest.mark.parametrize("sag", [0.0, 1e-4, 3e-4])
+def test_rotors_that_idle_empty_the_battery_slowly_however_long_they_do(sag: float, seed: int) -> None:
+    """A vehicle that hangs for half an hour: momentum theory has power go with thrust to the power of 1.5."""
+    load = climb_and_hover(Rotors(sag=sag, seed=seed), seconds=60.0)
+    assert load.curve is not None
+    before, share = load.curve, 0.25
+    idle = VehicleState(armed=True, landed=False, thrust=0.45 * share)
+    for _ in range(18_000):
+        load = watch_load(load, idle, MASS, 0.1, lifted=None)
+    after, emptied = load.curve, GRAVITY * sag * 1800.0 * share**1.5
+    assert after is not None
+    assert before.theta[0] - after.theta[0] == pytest.approx(emptied, abs=2.0 * math.sqrt(after.covariance[0][0]))
+    assert math.sqrt(after.covariance[0][0]) < 1.0, "it is still better known than before the flight"
+    assert after.gain_sigma > abs(after.gain - before.gain - emptied / GRAVITY)
+
+
 @pytest.mark.parametrize("thrust", [math.nan, 0.0])
 def test_without_a_thrust_there_is_no_load_of_this_moment_and_the_weight_stays(thrust: float) -> None:
     rotors = Rotors()
