@@ -72,7 +72,7 @@ class _Ask:
     """A request under way and who waits for its outcome."""
 
     key: _Key | None  # None: nobody waits
-    link: MavlinkLink  # on which it came last
+    links: list[MavlinkLink]  # on which it came; two stations may have the same ids
     progress: int = 255
 
 
@@ -161,7 +161,7 @@ class CommandService:
         for request in taken_back:
             self.answer(Answer(request, Result.CANCELLED, "asked to"))
         if running.keys() - taken_back:
-            self._submit(Order.ABORT, (), _Ask(None, link))
+            self._submit(Order.ABORT, (), _Ask(None, [link]))
 
     def answer(self, answer: Answer) -> None:
         """Tell whoever asked. Progress may be told often; the first other result ends the request."""
@@ -178,9 +178,11 @@ class CommandService:
             if answer.result is not Result.ACCEPTED:
                 self.counters.denied += answer.result is Result.DENIED
                 command = mav.MAV_CMD_ARM_ABORT if ask.key is None else ask.key.command
-                self._explain(ask.link, command, answer.result.value.replace("_", " "), answer.reason)
+                for link in ask.links:
+                    self._explain(link, command, answer.result.value.replace("_", " "), answer.reason)
         if ask.key is not None:
-            self._acknowledge(ask.link, ask.key, _RESULTS[answer.result], answer.progress)
+            for link in ask.links:
+                self._acknowledge(link, ask.key, _RESULTS[answer.result], answer.progress)
 
     def _order(self, command: Command, link: MavlinkLink) -> None:
         """Make a request of a command.
@@ -204,7 +206,7 @@ class CommandService:
             self._explain(link, command.command, "rejected", "too many commands at once")
             self._reply(link, command, mav.MAV_RESULT_TEMPORARILY_REJECTED)
             return
-        self._submit(order, parameters, _Ask(key, link))
+        self._submit(order, parameters, _Ask(key, [link]))
 
     def _require(self, command: Command, *, urgent: bool) -> None:
         try:
@@ -226,7 +228,8 @@ class CommandService:
         """Answer a retry without doing anything again; False for a new command."""
         for ask in self._asks.values():
             if ask.key == key:
-                ask.link = link
+                if link not in ask.links:
+                    ask.links.append(link)
                 self.counters.repeated += 1
                 self._acknowledge(link, key, mav.MAV_RESULT_IN_PROGRESS, ask.progress)
                 return True

@@ -33,6 +33,7 @@ from arm_companion.mission.facts import (
     WrenchSource,
 )
 from arm_companion.protocol.dialect import mav
+from tests.conftest import MavlinkPeer
 
 PX4 = mav.MAV_AUTOPILOT_PX4
 NAN = math.nan
@@ -225,6 +226,27 @@ def test_a_retry_while_running_does_nothing_twice(fly: Callable[..., None]) -> N
         assert rig.component.take() == ([], None)
         assert [m.progress for m in rig.ground.all("COMMAND_ACK")] == [255, 55, 55]
         assert rig.component.commands.counters.repeated == 2
+
+    fly(body)
+
+
+def test_each_link_on_which_a_command_came_gets_its_outcome(fly: Callable[..., None]) -> None:
+    """Two stations with the same ids, or one with two ways to us: which of them listens nobody knows."""
+
+    async def body(rig: Rig) -> None:
+        rig.autopilot.heartbeat(PX4, 0)
+        await asyncio.sleep(0.01)
+        behind = MavlinkPeer(255, 190)
+        behind.transport = rig.autopilot.transport
+        rig.ground.command(mav.MAV_CMD_ARM_PERCH)
+        behind.command(mav.MAV_CMD_ARM_PERCH)
+        await asyncio.sleep(0.01)
+        (request,), _ = rig.component.take()
+        rig.component.answer(Answer(request.id, Result.FAILED, "no contact"))
+        await asyncio.sleep(0.2)
+        for peer in (rig.ground, rig.autopilot):
+            assert [m.result for m in peer.all("COMMAND_ACK")][-1] == mav.MAV_RESULT_FAILED
+            assert "PERCH failed: no contact" in "".join(m.text for m in peer.all("STATUSTEXT"))
 
     fly(body)
 
