@@ -35,10 +35,11 @@ PX4_PACE_S: Final = 0.005
 """Least time between frames to PX4, measured."""
 
 SILENCE_S: Final = 0.05
-"""Half a frame that gets no more bytes for this long is noise: the bytes of one frame never pause so on a line."""
+"""Half a frame that gets no more bytes for this long is noise: a frame comes in one datagram, or in a few at once."""
 
-TCP_SILENCE_S: Final = 1.0
-"""The same over TCP, which brings every byte, but sends a lost segment again only after some time."""
+SILENCES_S: Final = {"serial": 0.3, "tcp": 1.0, "tcpin": 1.0}
+"""The same by the kind of link: a telemetry radio that takes turns with the other end cuts frames where its turn ends,
+and TCP brings every byte, but sends a lost segment again only after some time."""
 
 MOST_WAIT_S: Final = 0.05
 """A queue waits no longer for set-points, and they no longer (and for one long frame) for the line."""
@@ -125,7 +126,7 @@ class MavlinkLink:
         self._identified = role != "autopilot" or vehicle.system_id != 0
         to_px4 = role == "autopilot" and vehicle.autopilot == "px4"
         self._pace_s = self.config.pace_s or (PX4_PACE_S if to_px4 else 0.0)
-        self._silence_s = TCP_SILENCE_S if self.config.url.startswith("tcp") else SILENCE_S
+        self._silence_s = SILENCES_S.get(self.config.url.partition(":")[0], SILENCE_S)
         self._bandwidth = _bandwidth(self.config)
         self.tunnels = _decide(self.config.tunnel, auto=role == "autopilot")
         """Whether our own messages leave inside TUNNEL."""

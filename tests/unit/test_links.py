@@ -420,7 +420,9 @@ def test_time_stamps_go_on_after_a_restart_with_a_wrong_clock(tmp_path: Path) ->
         ("tcp:ground:5760", 0.3, True),
         ("tcpin:0.0.0.0:5760", 0.3, True),
         ("tcp:ground:5760", 1.1, False),
-        ("", 0.3, False),
+        ("serial:/dev/radio:57600", 0.25, True),
+        ("serial:/dev/radio:57600", 0.4, False),
+        ("udpin:0.0.0.0:14540", 0.3, False),
     ],
 )
 def test_the_second_half_of_a_frame_is_waited_for_as_long_as_its_way_may_pause(
