@@ -8,7 +8,7 @@ as fast as the processor allows and the same way every time.
 import asyncio
 import selectors
 import time
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, TypeVar
 
@@ -25,9 +25,19 @@ class Clock:
     relative to another.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, unix_now_s: float) -> None:
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, unix_now_s: float, wall: Callable[[], float] | None = None
+    ) -> None:
+        """Tie `loop` to Unix time.
+
+        Args:
+            loop: the running one.
+            unix_now_s: Unix time now.
+            wall: tells it at any later time, by the machine's own clock; None: there is no other than this one.
+        """
         self._loop = loop
         self._unix_offset_s = unix_now_s - loop.time()
+        self._wall = wall
 
     def now(self) -> float:
         """Seconds, monotonic, from an arbitrary start."""
@@ -36,6 +46,11 @@ class Clock:
     def unix(self, t: float) -> float:
         """Unix time in seconds of the monotonic instant `t`."""
         return t + self._unix_offset_s
+
+    @property
+    def wall_set_by_s(self) -> float:
+        """By how much the machine's own clock has been set since the start, s."""
+        return 0.0 if self._wall is None else self._wall() - self.unix(self.now())
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,5 +133,5 @@ def run_simulated(main: Coroutine[Any, Any, T]) -> T:
 
 
 def unix_now() -> float:
-    """The wall clock, read once at start to tie the loop's time to Unix time."""
+    """The wall clock, read at start to tie the loop's time to Unix time, and later to see whether it has been set."""
     return time.time()  # noqa: TID251 - the one place

@@ -40,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
         restore = stop_on_signals(stop)
         manager = ServiceManager()
         try:
-            clock = Clock(asyncio.get_running_loop(), unix_now())
+            clock = Clock(asyncio.get_running_loop(), unix_now(), unix_now)
             computer = ComputerWatch(state_directory(config) or Path("/"))
             openers = open_configured(config)
             daemon = Daemon(

@@ -14,7 +14,7 @@ from arm_companion.drivers.commands import URGENT, Translation, is_ours, read_co
 from arm_companion.drivers.component_metadata import GENERAL, metadata_files, uri
 from arm_companion.drivers.flight_stack import AutopilotFinder
 from arm_companion.drivers.ftp_server import FtpServer
-from arm_companion.drivers.guidance import Guidance
+from arm_companion.drivers.guidance import CLOCKS_APART_S, Guidance
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
 from arm_companion.drivers.parameter_service import IDS as PARAMETER_IDS
 from arm_companion.drivers.parameter_service import ParameterService
@@ -23,7 +23,7 @@ from arm_companion.drivers.standard_services import Power, StandardServices
 from arm_companion.drivers.status_text import Speaker
 from arm_companion.drivers.system_status import SystemStatus
 from arm_companion.drivers.timesync import addressee
-from arm_companion.mission.facts import Answer, Bar, Notice, Request
+from arm_companion.mission.facts import Answer, Bar, Notice, Request, Severity
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.ftp import crc32
 from arm_companion.protocol.mavlink import Message
@@ -83,6 +83,7 @@ class Component:
         """Whether a behaviour is under way that moves the vehicle."""
         self._links = links
         self._clock = clock
+        self._wall_told_s = 0.0
         self._started = clock.now()
         self._speaker = Speaker(links)
         self.access = Access(vehicle, mavlink, clock, self.notify)
@@ -143,6 +144,7 @@ class Component:
                 for link in self._links:
                     self._beat(link)
                 self.access.expire()
+                self._watch_wall_clock()
         finally:
             self.files.close()
             if self.parameters is not None:
@@ -151,6 +153,16 @@ class Component:
     def set_limits(self, limits: LimitsConfig) -> None:
         """What may be asked of the arm from now on."""
         self._translation.limits = self.guidance.limits = limits
+
+    def _watch_wall_clock(self) -> None:
+        """Say once when the computer's clock has been set: ours stays, and what others stamp no longer fits it."""
+        step = self._clock.wall_set_by_s
+        if abs(step - self._wall_told_s) > CLOCKS_APART_S:
+            self._wall_told_s = step
+            where = f"{abs(step):.1f} s {'ahead of' if step > 0.0 else 'behind'}"
+            text = f"the computer's clock was set and is {where} ours, which stays: restart the service on the ground"
+            log.warning("%s; until then targets and MQTT commands with the new time may be refused", text)
+            self.notify(Notice(Severity.WARNING, text))
 
     # --- identity ---
 

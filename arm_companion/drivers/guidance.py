@@ -17,7 +17,7 @@ from arm_companion.protocol.mavlink import Message
 
 _COMPLAINT_PERIOD_S: Final = 2.0
 _MOST_SENDERS: Final = 64
-_CLOCKS_APART_S: Final = 0.5
+CLOCKS_APART_S: Final = 0.5
 """By how much a sender's clock may run ahead of ours."""
 
 
@@ -158,7 +158,7 @@ class Guidance:
         age = self._clock.unix(now) - stamp
         if age > self._max_age_s:
             raise CommandRejected(f"it is {age:.3g} s old; at most {self._max_age_s:g} s are allowed")
-        if age < -_CLOCKS_APART_S:
+        if age < -CLOCKS_APART_S:
             raise CommandRejected(f"its time is {-age:.3g} s ahead of ours")
         key = (message.get_srcSystem(), message.get_srcComponent(), message.get_msgId(), message.kind)
         if stamp <= self._newest.get(key, float("-inf")):

@@ -219,3 +219,25 @@ def test_an_impossible_setpoint_is_refused_with_the_reason(changes: dict[str, An
         assert rig.component.guidance.counters.bad_setpoints == 5
 
     serve(body)
+
+
+def test_a_step_of_the_computers_clock_is_told_once_for_each() -> None:
+    """What a vision program on this computer stamps is refused from then on, and people must know why."""
+
+    async def body(rig: ServiceRig) -> None:
+        loop, set_by = asyncio.get_running_loop(), [0.0]
+        rig.component._clock._wall = lambda: SIMULATED_EPOCH_S + loop.time() + set_by[0]
+        await asyncio.sleep(3.0)
+        assert "clock" not in rig.words()
+        set_by[0] = 3600.0
+        await asyncio.sleep(3.0)
+        assert rig.words().count("clock was set and is 3600.0 s ahead of ours") == 1
+        rig.ground.send(target(time_usec=stamp(-3600.0)))
+        await soon()
+        assert rig.component.guidance.take_bar() is None
+        assert "ahead of ours" in rig.words()
+        set_by[0] = -2.0
+        await asyncio.sleep(3.0)
+        assert rig.words().count("clock was set and is 2.0 s behind ours") == 1
+
+    serve(body)
