@@ -86,8 +86,13 @@ def is_open(s: Situation) -> bool:
     if order is None or order.action is not GripperAction.OPEN:
         return False
     if (jaws := s.jaws) is not None:
-        return jaws.homed and not jaws.silent and jaws.closed <= _OPEN
+        return stand_open(jaws)
     return _taken(s)
+
+
+def stand_open(jaws: JawState) -> bool:
+    """Whether a servo's jaws are surely open, whoever opened them."""
+    return jaws.homed and not jaws.silent and jaws.closed <= _OPEN
 
 
 def is_shut(s: Situation) -> bool:

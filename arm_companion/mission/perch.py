@@ -29,7 +29,7 @@ from arm_companion.mission.hazards import (
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, norm, sub
 from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, tested_to_hang
-from arm_companion.mission.refusals import cannot_clear, cannot_set_out
+from arm_companion.mission.refusals import cannot_clear, cannot_set_out, may_hold
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import CARRYING, PerchKind, Phase
 
@@ -269,7 +269,7 @@ ORDERS: tuple[Ask, ...] = (
     Ask(Order.ABORT, GRASPING | GRIPPED, Phase.UNLOAD, frozenset({Phase.UNLOAD})),
     Ask(Order.ABORT, frozenset({Phase.READYING, Phase.READY}), Phase.STOWING, frozenset({Phase.STOWING})),
     # servos may be rebooted and homed only where nothing hangs on them; `done` is when they are well
-    Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset()),
+    Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset(), may_hold),
     Ask(Order.CLEAR_ERRORS, STOWED_ONLY, Phase.STOWED, frozenset()),
     Ask(Order.CLEAR_ERRORS, frozenset({Phase.HOLDING}), Phase.STOWED, frozenset(), cannot_clear),
     *(Ask(Order.FEEDFORWARD, frozenset({phase}), phase, frozenset({phase})) for phase in Phase),

@@ -39,20 +39,26 @@ def _wraps_into_keep_out(s: Situation) -> str | None:
 def cannot_clear(s: Situation) -> str | None:
     """Why the servos of an arm that was left holding cannot be brought back now.
 
-    A vehicle whose motors were stopped at a bar may hang by its arm, although the autopilot says that it stands. So
-    nothing may hold any more: what has torque stands where the straight arm has it. Of a silent servo its last word
-    counts.
+    A vehicle whose motors were stopped at a bar may hang by its arm, although the autopilot says that it stands.
     """
     if s.arm_above:
         return "an arm above may carry the vehicle"
     if (reason := vehicle_silent(s) or vehicle_arms(s)) is not None:
         return reason
+    held = may_hold(s)
+    return None if held is None else f"{held}: RELEASE; if it still does, take the servos' power away for a moment"
+
+
+def may_hold(s: Situation) -> str | None:
+    """What has torque and stands elsewhere than the straight arm, or open jaws, have it; silent, its last word counts.
+
+    Returns:
+        The first of them in words.
+    """
     most = _LET_OUT_RAD * s.parameters.model.parameters.r
     holding = [
         f"tendon {i + 1}" for i, t in enumerate(s.facts.tendons) if t.torque and not (t.homed and abs(t.pull) <= most)
     ]
-    if s.jaws is not None and s.jaws.torque and not gripper.is_open(s):
+    if s.jaws is not None and s.jaws.torque and not gripper.stand_open(s.jaws):
         holding.append("gripper")
-    if not holding:
-        return None
-    return f"{holding[0]} holds, or may hold: RELEASE; if it still does, take the servos' power away for a moment"
+    return f"{holding[0]} holds, or may hold" if holding else None

@@ -107,6 +107,21 @@ def test_what_holds_or_may_hold_is_not_let_go(
     assert not any(said.recover for said in run.said)
 
 
+@pytest.mark.parametrize(("bend", "result"), [(BENT, Result.TEMPORARILY_REJECTED), ((0.0, 0.0), Result.IN_PROGRESS)])
+def test_a_daemon_that_starts_beside_an_arm_that_holds_reboots_none_of_its_servos(
+    bend: tuple[float, float], result: Result, parameters: Parameters, hovering: Hovering
+) -> None:
+    """A restart under the bar, with a low supply and one servo silent: those that report it still hold the vehicle."""
+    low = tuple(tendon(i, error_bits=0x01, ready=False) for i in range(3))
+    facts = changed(hovering(bend), (*low, tendon(3, silent=True, torque=False, pull=0.0)))
+    run = Run(memory(Phase.STARTUP), parameters)
+    run.cycles(facts, 0.1)
+    commands = run.cycle(ask(facts, Order.CLEAR_ERRORS))
+    assert commands.answers[0].result is result
+    assert commands.recover is (result is Result.IN_PROGRESS)
+    assert run.phases == [Phase.STARTUP]
+
+
 @pytest.mark.parametrize(("torque", "result"), [(True, Result.TEMPORARILY_REJECTED), (False, Result.IN_PROGRESS)])
 def test_jaws_that_hold_are_released_first(
     torque: bool, result: Result, parameters: Parameters, hovering: Hovering
