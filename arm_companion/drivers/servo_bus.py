@@ -359,8 +359,8 @@ class ServoBus:
         """Bring back what can be brought back, at the word of somebody who sees the arm hang straight.
 
         Servos with a hardware error are rebooted, watchdog trips cleared, and servos that lost their turns
-        accepted near their zeros, or where they stood without torque before the reboot. One that is well is not
-        touched. All are tried whatever happens to one.
+        accepted near their zeros, or where they stood without torque before the reboot. One that is well, or still
+        too hot, is not touched. All are tried whatever happens to one.
 
         Raises:
             ExceptionGroup: of one `DeviceFault` for each servo that could not be brought back.
@@ -370,6 +370,9 @@ class ServoBus:
     async def _recover(self, record: ServoRecord) -> None:
         near: int | None = None
         if record.error_bits:
+            hot = await self._link.read(record.id, ct.PRESENT_TEMPERATURE)
+            if record.error_bits & ct.HardwareError.OVERHEATING and hot > self._config.temperature_limit_c:
+                raise DeviceFault(record.id, record.error_bits, f"still at {hot} degC")  # it would shut down again
             if record.feedback is not None and not (record.turns_lost or record.torque):
                 near = record.feedback.position  # its tendon may be slack, more than a turn from its zero
             await self.reboot(record.id)

@@ -212,6 +212,26 @@ def test_a_servo_that_shut_down_more_than_a_turn_from_its_zero_is_found_where_it
     story(play)
 
 
+def test_a_servo_that_is_still_hot_is_not_rebooted_so_that_it_knows_its_turns_when_it_has_cooled() -> None:
+    async def play(arm: Arm) -> None:
+        away = HOME + 5000
+        await arm.run(4.0, away)
+        arm.emulator[2].warm(90.0)
+        await arm.run(0.3, away, until=lambda: arm.faults() == {2: HardwareError.OVERHEATING})
+        with pytest.raises(ExceptionGroup) as refused:
+            await arm.meanwhile(arm.bus.recover(), away)
+        assert "still" in str(refused.value.exceptions[0])
+        assert arm.bus.counters().servos[2].power_losses == 0
+        arm.emulator[2].warm(40.0)
+        await arm.run(0.1, away)
+        await arm.meanwhile(arm.bus.recover(), away)
+        await arm.run(0.5, away)
+        assert arm.faults() == {}
+        assert arm.at(away, ALL), "and not a turn nearer to its zero"
+
+    story(play)
+
+
 def test_a_servo_that_restarts_by_itself_is_not_believed_and_the_others_go_on() -> None:
     async def play(arm: Arm) -> None:
         arm.emulator[4].reboot()
