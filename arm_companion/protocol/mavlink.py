@@ -186,7 +186,13 @@ class MavlinkCodec:
         Returns:
             The wanted messages that are complete now, in order. Never raises for anything received.
         """
-        return self._scan(self._rest + data if self._rest else data, final=False)
+        if not (self._rest and _are_frames(data)):
+            return self._scan(self._rest + data if self._rest else data, final=False)
+        # whoever began the half frame, these came from somebody else, or noise began it: they need not wait for it
+        begun = self._rest
+        messages = self._scan(data, final=False)
+        self._rest = begun
+        return messages
 
     def flush(self) -> list[Message]:
         """The line has been silent for long: give up on half a frame, and read what hides behind it.
@@ -294,6 +300,18 @@ def _next_magic(data: bytes, at: int) -> int:
         return at
     found = _ANY_MAGIC.search(data, at)
     return len(data) if found is None else found.start()
+
+
+def _are_frames(data: bytes) -> bool:
+    """Whether the data are whole good frames with known ids, and nothing else."""
+    at, size = 0, len(data)
+    while at < size and data[at] in MAGICS and (end := _frame_end(data, at)) <= size:
+        head = _header(data, at)
+        layout = _LAYOUTS.get(head.id)
+        if head.flags & ~SIGNED or layout is None or not _checksum_fits(data, head, layout):
+            return False
+        at = end
+    return at == size > 0
 
 
 def _frame_end(data: bytes, at: int) -> int:

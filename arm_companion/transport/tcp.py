@@ -100,7 +100,7 @@ class TcpServer:
     """A listening socket and its connections.
 
     What is written goes to every client, and a slow one costs the others nothing. What clients send comes
-    chunk by chunk as it arrives: a frame that the network cuts in two while another client speaks is damaged.
+    chunk by chunk as it arrives: between the halves of a frame that the network cuts in two may stand another's.
     """
 
     def __init__(self, receiver: Receiver) -> None:

@@ -204,6 +204,23 @@ def test_half_a_frame_holds_a_real_one_back_only_until_the_line_is_silent() -> N
     assert [m.get_type() for m in reader.flush()] == ["HEARTBEAT"]
 
 
+@pytest.mark.parametrize("half", [bytes([MAGIC_V2, 255, 0]), b"frame"], ids=["noise", "another sender's"])
+def test_whole_frames_do_not_wait_for_the_rest_of_another_one(half: bytes) -> None:
+    """Several stations on one TCP port: each sends whole frames, and the network may cut one anywhere."""
+    one, other, reader = MavlinkCodec(255, 190), MavlinkCodec(254, 190), MavlinkCodec(1, 192)
+    cut = one.encode(mav.MAVLink_command_long_message(1, 192, 64005, 0, *[0.0] * 7))
+    begun = half == b"frame"
+    assert reader.feed(cut[:20] if begun else half) == []
+    whole = other.encode(heartbeat()) + other.encode(heartbeat())
+    for _ in range(3):
+        assert [m.get_srcSystem() for m in reader.feed(whole)] == [254, 254]
+    assert reader.pending
+    if begun:
+        assert [m.get_type() for m in reader.feed(cut[20:])] == ["COMMAND_LONG"]
+        assert not reader.pending
+    assert reader.counters.bad_crc == 0
+
+
 def test_frames_with_unknown_incompatibility_flags_are_dropped() -> None:
     frame = bytearray(MavlinkCodec(1, 1).encode(heartbeat()))
     frame[2] = 0x02
