@@ -45,7 +45,7 @@ from arm_companion.mission.state import MOVES_VEHICLE, Phase, State
 from arm_companion.onlookers import Onlookers
 from arm_companion.record import configured_recorder
 from arm_companion.record.raw import Taps
-from arm_companion.record.recorder import Record, Recorder
+from arm_companion.record.recorder import Record, Recorder, failed_cycle
 from arm_companion.supervisor import ServiceManager, run_until
 from arm_companion.transport.base import Opener
 from arm_companion.transport.urls import open_bus, open_url
@@ -246,7 +246,11 @@ class Daemon:
         facts = await self._observe()
         now = self._clock.now()
         before = self._state
-        self._state, commands = step(before, facts, now, self._parameters)
+        try:
+            self._state, commands = step(before, facts, now, self._parameters)
+        except Exception as error:
+            self._recorder.failed(failed_cycle(now, facts, before, error))
+            raise
         try:
             await self._act(commands, facts, now)
         finally:  # memory has moved on: without this cycle the record would not lead to the next

@@ -62,12 +62,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 0 if outcome.identical else 3
 
 
+def _show_failed(failed: list[Any]) -> None:
+    """What was raised in flight, each kind once, and what becomes of it today."""
+    kinds: dict[tuple[str, str, str], list[Any]] = {}
+    for one in failed:
+        kinds.setdefault((one.recorded, one.where, one.now), []).append(one)
+    for (recorded, where, now), same in list(kinds.items())[:_SHOWN]:
+        first = f"cycle {same[0].cycle}, {same[0].seconds:.2f} s"
+        if len(same) == 1:
+            print(f"{first} failed in flight: {recorded} ({where})")
+        else:
+            print(f"{len(same)} cycles failed in flight, from {first} on: {recorded} ({where})")
+        if now:
+            print(f"  today's code fails there {'in the same way' if now == recorded else f'too: {now}'}")
+        else:
+            print("  today's code does not fail there")
+
+
 def _show(outcome: Any, wall: float, asks: bool) -> None:
     print(f"{outcome.cycles} cycles, {outcome.seconds:.1f} s of flight, replayed in {wall:.1f} s")
     for remark in outcome.remarks:
         print(f"note: {remark}")
     for first, count in outcome.gaps:
         print(f"note: {count} cycles are missing from cycle {first} on; memory is taken from the record there")
+    _show_failed(outcome.failed)
     if outcome.identical:
         print("every command is the same, bit for bit")
         return
@@ -78,7 +96,8 @@ def _show(outcome: Any, wall: float, asks: bool) -> None:
     print(f"  now:      {first.now}")
     for name, greatest in outcome.greatest.items():
         print(f"greatest difference of {name}: {greatest.value:.3g} {greatest.unit} at {greatest.seconds:.2f} s")
-    for cycle, text in outcome.failures[:_SHOWN]:
+    told = {failed.cycle for failed in outcome.failed}
+    for cycle, text in [failure for failure in outcome.failures if failure[0] not in told][:_SHOWN]:
         print(f"today's code failed in cycle {cycle}: {text}")
     for reason in outcome.why or ["nothing around the code differs: the code itself does"]:
         print(f"why: {reason}")

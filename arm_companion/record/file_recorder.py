@@ -23,12 +23,13 @@ from arm_companion.config.table import as_table
 from arm_companion.mission.facts import Notice
 from arm_companion.record import storage
 from arm_companion.record.mcap_file import McapFile
-from arm_companion.record.recorder import Frame, Record, Recorder
+from arm_companion.record.recorder import FailedCycle, Frame, Record, Recorder
 from arm_companion.record.starts import starts_text
 from arm_companion.record.topics import (
     COMMANDS,
     CONFIGURATION,
     FACTS,
+    FAILURES,
     LOG,
     RAW,
     STARTS,
@@ -61,13 +62,14 @@ _MB: Final = 1_000_000
 
 
 class _Cycle(NamedTuple):
-    """Facts, memory and commands of a cycle, as they stand in the file."""
+    """Facts, memory, and commands or failure of a cycle, as they stand in the file."""
 
     sequence: int
     t: float
     facts: bytes
     state: bytes
-    commands: bytes
+    topic: str
+    outcome: bytes
     starts: bytes
 
 
@@ -123,7 +125,7 @@ class FileRecorder(Recorder):
         self._open_file = open_file
         self._queue: collections.deque[_Batch] = collections.deque()
         self._batch = _Batch()
-        self._records: list[Record] = []
+        self._records: list[Record | FailedCycle] = []
         self._sequence = 0
         self._starts_at = float("-inf")
         self._raw_left = 0.0
@@ -174,6 +176,13 @@ class FileRecorder(Recorder):
 
     def put(self, record: Record) -> None:
         """Take the cycle, or count it as dropped."""
+        self._add(record)
+
+    def failed(self, cycle: FailedCycle) -> None:
+        """Take the cycle, or count it as dropped."""
+        self._add(cycle)
+
+    def _add(self, record: Record | FailedCycle) -> None:
         self._records.append(record)
         if len(self._records) >= _TOGETHER:
             self._flush()
@@ -200,15 +209,20 @@ class FileRecorder(Recorder):
             self._slow = False
             self._troubles.append(f"record: complete again, {self.dropped} cycles are missing")
 
-    def _in_words(self, sequence: int, record: Record) -> _Cycle | None:
+    def _in_words(self, sequence: int, record: Record | FailedCycle) -> _Cycle | None:
         stamp = {"t": record.t}
         try:
+            if isinstance(record, Record):
+                topic, outcome = COMMANDS, plain(record.commands)
+            else:
+                topic, outcome = FAILURES, {"error": record.error, "where": record.where}
             return _Cycle(
                 sequence,
                 record.t,
                 orjson.dumps(stamp | plain(record.facts)),
                 orjson.dumps(plain(record.state)),
-                orjson.dumps(stamp | plain(record.commands)),
+                topic,
+                orjson.dumps(stamp | outcome),
                 self._starts(record),
             )
         except Exception:
@@ -216,7 +230,7 @@ class FileRecorder(Recorder):
             self._lose(1)
             return None
 
-    def _starts(self, record: Record) -> bytes:
+    def _starts(self, record: Record | FailedCycle) -> bytes:
         """Where the solver starts in this cycle, when that is due."""
         if record.state.prediction is None or 0.0 <= record.t - self._starts_at < _STARTS_S:
             return b""
@@ -323,7 +337,7 @@ class FileRecorder(Recorder):
                 file.raw(STARTS, now, cycle.starts, cycle.sequence)
             file.raw(FACTS, now, cycle.facts, cycle.sequence)
             file.raw(STATE, now, cycle.state, cycle.sequence)
-            file.raw(COMMANDS, now, cycle.commands, cycle.sequence)
+            file.raw(cycle.topic, now, cycle.outcome, cycle.sequence)
 
     def _write_config(self, file: McapFile, t: float, config: Config) -> None:
         file.json(CONFIGURATION, self._ns(t), {"t": t, "config": as_table(config)})

@@ -18,6 +18,19 @@ class Record:
     commands: Commands
 
 
+@dataclass(frozen=True, slots=True)
+class FailedCycle:
+    """One cycle whose step raised; the memory before it is that after it too."""
+
+    t: float  # loop time, s
+    facts: Facts
+    state: State
+    error: str
+    """What was raised, in words."""
+    where: str
+    """The place in this package, "MODULE:LINE in FUNCTION"."""
+
+
 class Frame(NamedTuple):
     """Bytes that passed over a link or the servo bus at once."""
 
@@ -25,6 +38,22 @@ class Frame(NamedTuple):
     pipe: str  # "mavlink/NAME" or "servos"
     sent: bool
     data: bytes
+
+
+def failed_cycle(t: float, facts: Facts, state: State, error: Exception) -> FailedCycle:
+    """A cycle that has just raised this."""
+    where, trace = "", error.__traceback__
+    while trace is not None:  # NumPy's own lines would say little
+        module = trace.tb_frame.f_globals.get("__name__", "")
+        if module.partition(".")[0] == "arm_companion":
+            where = f"{module}:{trace.tb_lineno} in {trace.tb_frame.f_code.co_name}"
+        trace = trace.tb_next
+    return FailedCycle(t, facts, state, in_words(error), where)
+
+
+def in_words(error: Exception) -> str:
+    """Kind and text of an exception."""
+    return f"{type(error).__name__}: {error}"
 
 
 class Recorder:
@@ -41,6 +70,9 @@ class Recorder:
 
     def put(self, record: Record) -> None:
         """Take one cycle."""
+
+    def failed(self, cycle: FailedCycle) -> None:
+        """Take one cycle that commanded nothing."""
 
     def notice(self, t: float, notice: Notice) -> None:
         """Take one sentence for people."""
@@ -88,6 +120,11 @@ class Both(Recorder):
         """See `Recorder`."""
         for recorder in self._recorders:
             recorder.put(record)
+
+    def failed(self, cycle: FailedCycle) -> None:
+        """See `Recorder`."""
+        for recorder in self._recorders:
+            recorder.failed(cycle)
 
     def notice(self, t: float, notice: Notice) -> None:
         """See `Recorder`."""

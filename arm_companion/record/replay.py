@@ -20,8 +20,9 @@ from arm_companion.mission.mission import step
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record.reader import Item, Reader
+from arm_companion.record.recorder import in_words
 from arm_companion.record.starts import started
-from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, STARTS, STATE, transition
+from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, FAILURES, STARTS, STATE, transition
 from arm_companion.record_codec import build, plain
 
 Change = Callable[[Config], Config]
@@ -41,8 +42,11 @@ class Written(NamedTuple):
     facts: bytes
     state: bytes
     commands: bytes
+    """Empty: its step raised."""
     starts: bytes = b""
     """Where the solver starts, which stands with one cycle now and then."""
+    failure: bytes = b""
+    """What its step raised."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +59,20 @@ class Cycle:
     state: bytes
     commands: bytes
     starts: bytes = b""
+    failure: str = ""
+    where: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """A cycle whose step raised in flight."""
+
+    cycle: int
+    seconds: float  # since the first cycle
+    recorded: str
+    where: str
+    now: str
+    """What today's code raises there; empty: nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +112,7 @@ class Outcome:
     cycles: int = 0
     same: int = 0
     failures: list[tuple[int, str]] = field(default_factory=list)  # cycle, and what today's code raised
+    failed: list[Failed] = field(default_factory=list)  # in flight
     gaps: list[tuple[int, int]] = field(default_factory=list)  # cycles that are missing: first, how many
     first: Difference | None = None
     why: list[str] = field(default_factory=list)
@@ -105,7 +124,7 @@ class Outcome:
 
     @property
     def identical(self) -> bool:
-        """Every command of every cycle is the same, bit for bit."""
+        """Every command of every cycle is the same, bit for bit; what failed in flight fails in the same words."""
         return self.same == self.cycles
 
 
@@ -168,16 +187,18 @@ def written(reader: Reader) -> Iterator[Written | Config]:
         ConfigError: a configuration is not what this version knows.
     """
     parts: dict[str, Item] = {}
-    for item in reader.messages((FACTS, STATE, COMMANDS, CONFIGURATION, STARTS)):
+    for item in reader.messages((FACTS, STATE, COMMANDS, FAILURES, CONFIGURATION, STARTS)):
         if item.topic == CONFIGURATION:
             yield from_table(orjson.loads(item.data)["config"], f"configuration of {reader.path.name}")
             continue
         parts[item.topic] = item
-        if item.topic == COMMANDS and FACTS in parts and parts[FACTS].sequence == item.sequence:
+        whole = item.topic in {COMMANDS, FAILURES}
+        if whole and FACTS in parts and parts[FACTS].sequence == item.sequence:
             state = parts[STATE].data if STATE in parts else b""
             begin = parts.pop(STARTS, None)
             starts = begin.data if begin is not None and begin.sequence == item.sequence else b""
-            yield Written(item.sequence, parts[FACTS].data, state, item.data, starts)
+            ends = (item.data, starts) if item.topic == COMMANDS else (b"", starts, item.data)
+            yield Written(item.sequence, parts[FACTS].data, state, *ends)
 
 
 def cycle_of(text: Written) -> Cycle:
@@ -188,7 +209,9 @@ def cycle_of(text: Written) -> Cycle:
     """
     table = orjson.loads(text.facts)
     t = float(table.pop("t"))
-    return Cycle(text.number, t, build(Facts, table), text.state, text.commands, text.starts)
+    failure = orjson.loads(text.failure) if text.failure else {"error": "", "where": ""}
+    facts = build(Facts, table)
+    return Cycle(text.number, t, facts, text.state, text.commands, text.starts, failure["error"], failure["where"])
 
 
 class Runner:
@@ -232,13 +255,21 @@ class Runner:
         outcome.cycles += 1
         seconds = outcome.seconds = cycle.t - self.start
         state = self.state or State()
+        raised = ""
         try:
-            self.state, commands = step(state, cycle.facts, cycle.t, self.parameters)
+            after, commands = step(state, cycle.facts, cycle.t, self.parameters)
         except Exception as error:  # noqa: BLE001 - as in the daemon: the cycle fails, the next one comes
-            outcome.failures.append((cycle.number, f"{type(error).__name__}: {error}"))
-            self._note_first(cycle, seconds, "", "commands", f"{type(error).__name__}: {error}")
+            raised = in_words(error)
+            outcome.failures.append((cycle.number, raised))
+        if cycle.failure:  # the daemon's memory stayed as it was, and the facts that follow are of that
+            self.state = state
+            self._compare_failure(cycle, seconds, raised)
+            return
+        if raised:
+            self._note_first(cycle, seconds, "", "commands", raised)
             outcome.recorded += _moves(orjson.loads(cycle.commands), seconds)
             return
+        self.state = after
         now = orjson.dumps({"t": cycle.t} | plain(commands))
         if now == cycle.commands:
             outcome.same += 1
@@ -267,6 +298,14 @@ class Runner:
             self._outcome.why.append(
                 "cycles are missing, and where the solver starts behind them: last bits may differ after the gap"
             )
+
+    def _compare_failure(self, cycle: Cycle, seconds: float, now: str) -> None:
+        outcome = self._outcome
+        outcome.failed.append(Failed(cycle.number, seconds, cycle.failure, cycle.where, now))
+        if now == cycle.failure:
+            outcome.same += 1
+        else:
+            self._note_first(cycle, seconds, "failure", cycle.failure, now or "none")
 
     def _compare(self, cycle: Cycle, recorded: dict[str, Any], now: dict[str, Any], seconds: float) -> None:
         outcome = self._outcome

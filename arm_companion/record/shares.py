@@ -82,7 +82,7 @@ def share(path: Path, mechanics: str, stretch: tuple[int, int]) -> Outcome | Non
             if isinstance(found, Config):
                 runner.configure(found)
                 continue
-            if found.number != (0 if expected is None else expected):
+            if found.failure or found.number != (0 if expected is None else expected):
                 return None
             if expected is None:
                 runner.start = cycle_of(found).t

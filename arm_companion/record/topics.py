@@ -23,6 +23,8 @@ METADATA: Final = "arm_companion"
 FACTS: Final = "/facts"
 STATE: Final = "/state"
 COMMANDS: Final = "/commands"
+FAILURES: Final = "/failures"
+"""What a cycle's step raised; stands where its commands would."""
 STARTS: Final = "/starts"
 """Where the solver starts from in the cycle of the same number, once in a while."""
 TRANSITIONS: Final = "/transitions"
@@ -74,6 +76,7 @@ SCHEMAS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
     # the state's own `t` is that of the step before
     STATE: ("arm_companion.State", schema(State)),
     COMMANDS: ("arm_companion.Commands", _timed(schema(Commands))),
+    FAILURES: ("arm_companion.Failure", _timed({"properties": {"error": _STRING, "where": _STRING}})),
     STARTS: (
         "arm_companion.Starts",
         _timed({"properties": {name: {"type": "object"} for name in ("free", "anchored", "stiffness")}}),

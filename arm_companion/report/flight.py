@@ -15,7 +15,7 @@ from arm_companion.errors import ConfigError, RecordError
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import ArmFault
 from arm_companion.record.reader import Reader
-from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, LOG, TRUTH, transition
+from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, FAILURES, LOG, TRUTH, transition
 from arm_companion.report.extremes import Extremes
 
 _PERIOD_NS: Final = 50_000_000
@@ -85,6 +85,7 @@ class RecordedFlight:
     config: Config | None = None
     cycles: int = 0
     missing: int = 0
+    failed: list[tuple[float, str]] = field(default_factory=list)  # cycles: s since the first one, what was raised
     began_ns: int = 0
 
     @property
@@ -101,10 +102,15 @@ def read(reader: Reader, truth: Reader | None = None) -> RecordedFlight:
     """
     collected = _Collected()
     try:
-        for item in reader.messages((FACTS, COMMANDS, LOG, CONFIGURATION)):
+        for item in reader.messages((FACTS, COMMANDS, FAILURES, LOG, CONFIGURATION)):
             collected.take(item.topic, item.sequence, item.unix_ns, item.data)
         if not collected.rows:
-            raise RecordError(f"{reader.path}: {'; '.join([*reader.remarks, 'it has no whole cycle'])}")
+            none = (
+                f"it has no cycle that did not fail: {collected.failed[0][1]}"
+                if collected.failed
+                else "it has no whole cycle"
+            )
+            raise RecordError(f"{reader.path}: {'; '.join([*reader.remarks, none])}")
         flight = collected.flight()
     except (KeyError, TypeError, ValueError) as error:
         version = reader.versions.get("version", "?")
@@ -125,6 +131,7 @@ class _Collected:
         self.rows: list[array[float]] = []
         self.remarks: list[str] = []
         self.first = 0  # number of the first cycle
+        self.failed: list[tuple[float, str]] = []  # loop time, s; what was raised
         self._start = self._end = 0.0
         self._began_ns = self._last_ns = 0
         self._facts: tuple[int, bytes] = (-1, b"")
@@ -139,9 +146,14 @@ class _Collected:
         """Take one message."""
         if topic == FACTS:
             self._facts = (sequence, data)
-        elif topic == COMMANDS:
+        elif topic in {COMMANDS, FAILURES}:
             if self._facts[0] == sequence:
-                self._cycle(sequence, unix_ns, orjson.loads(self._facts[1]), orjson.loads(data))
+                table = orjson.loads(data)
+                self._count(sequence, unix_ns, float(table["t"]))
+                if topic == COMMANDS:
+                    self._cycle(unix_ns, orjson.loads(self._facts[1]), table)
+                else:
+                    self.failed.append((float(table["t"]), f"{table['error']} ({table['where']})"))
         elif topic == LOG:
             table = orjson.loads(data)
             self._said.append((unix_ns, _LEVELS.get(table["level"], "info"), table["message"]))
@@ -151,15 +163,17 @@ class _Collected:
             except ConfigError as error:
                 self.remarks = [f"limits are not looked at: {error}"]
 
-    def _cycle(self, sequence: int, unix_ns: int, facts: dict[str, Any], commands: dict[str, Any]) -> None:
-        t = self._end = float(commands["t"])
+    def _count(self, sequence: int, unix_ns: int, t: float) -> None:
+        self._end = t
         if self._next is None:
             self.first = self._next = sequence
             self._start, self._began_ns = t, unix_ns
         self._cycles += 1
         self._missing += sequence - self._next
         self._next = sequence + 1
-        self._follow(t, commands)
+
+    def _cycle(self, unix_ns: int, facts: dict[str, Any], commands: dict[str, Any]) -> None:
+        self._follow(self._end, commands)
         self._most.see(facts, commands)
         if not self.rows or unix_ns - self._last_ns >= _PERIOD_NS:
             self._last_ns = unix_ns
@@ -200,6 +214,7 @@ class _Collected:
             config=self._config,
             cycles=self._cycles,
             missing=self._missing,
+            failed=[(t - self._start, text) for t, text in self.failed],
             began_ns=self._began_ns,
         )
 

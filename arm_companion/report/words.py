@@ -37,6 +37,13 @@ class Verdict:
 def judge(flight: RecordedFlight) -> Verdict:
     """The verdict."""
     bad = [f"{said.text} ({said.t:.1f} s)" for said in flight.said if said.level in {"critical", "error"}]
+    if flight.failed:
+        count = len(flight.failed)
+        first, text = flight.failed[0]
+        which = (
+            f"a cycle failed at {first:.1f} s" if count == 1 else f"{count} cycles failed, the first at {first:.1f} s"
+        )
+        bad.append(f"{which}: {text}")
     if flight.spans and flight.spans[-1].name not in _AT_REST:
         bad.append(f"the record ends in state {flight.spans[-1].name}")
     look = [f"{said.text} ({said.t:.1f} s)" for said in flight.said if said.level == "warning"]
