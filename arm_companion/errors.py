@@ -71,3 +71,19 @@ class CommandRejected(ArmError):
     def __init__(self, reason: str) -> None:
         self.reason = reason
         super().__init__(reason)
+
+
+def in_words(error: BaseException) -> str:
+    """Kind and text of an exception, such as one that nobody foresaw."""
+    return f"{type(error).__name__}: {error}"
+
+
+def place(error: BaseException) -> str:
+    """Where in this package it came from, "MODULE:LINE in FUNCTION"; empty: not from here."""
+    where, trace = "", error.__traceback__
+    while trace is not None:  # NumPy's own lines would say little
+        module = trace.tb_frame.f_globals.get("__name__", "")
+        if module.partition(".")[0] == "arm_companion":
+            where = f"{module}:{trace.tb_lineno} in {trace.tb_frame.f_code.co_name}"
+        trace = trace.tb_next
+    return where

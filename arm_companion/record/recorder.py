@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from arm_companion.config.schema import Config
+from arm_companion.errors import in_words, place
 from arm_companion.mission.facts import Commands, Facts, Notice
 from arm_companion.mission.state import State
 
@@ -42,18 +43,7 @@ class Frame(NamedTuple):
 
 def failed_cycle(t: float, facts: Facts, state: State, error: Exception) -> FailedCycle:
     """A cycle that has just raised this."""
-    where, trace = "", error.__traceback__
-    while trace is not None:  # NumPy's own lines would say little
-        module = trace.tb_frame.f_globals.get("__name__", "")
-        if module.partition(".")[0] == "arm_companion":
-            where = f"{module}:{trace.tb_lineno} in {trace.tb_frame.f_code.co_name}"
-        trace = trace.tb_next
-    return FailedCycle(t, facts, state, in_words(error), where)
-
-
-def in_words(error: Exception) -> str:
-    """Kind and text of an exception."""
-    return f"{type(error).__name__}: {error}"
+    return FailedCycle(t, facts, state, in_words(error), place(error))
 
 
 class Recorder:

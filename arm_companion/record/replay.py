@@ -14,13 +14,12 @@ from arm_companion.arm.parameters import ArmParameters
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config.schema import Config
 from arm_companion.config.table import from_table
-from arm_companion.errors import RecordError
+from arm_companion.errors import RecordError, in_words
 from arm_companion.mission.facts import Facts
 from arm_companion.mission.mission import step
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.state import State
 from arm_companion.record.reader import Item, Reader
-from arm_companion.record.recorder import in_words
 from arm_companion.record.starts import started
 from arm_companion.record.topics import COMMANDS, CONFIGURATION, FACTS, FAILURES, STARTS, STATE, transition
 from arm_companion.record_codec import build, plain

@@ -19,6 +19,7 @@ from statistics import NormalDist
 
 from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
+from arm_companion.errors import ArmError, ConfigError, in_words, place
 from arm_companion.sim.judges import SCENARIOS
 from arm_companion.sim.runner import fly_simulated
 
@@ -257,7 +258,12 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
     drawn = draw(config, seed)
     script = SCENARIOS[scenario]
     fly = script.fly_trial or script.fly
-    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=fly))
+    try:
+        result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=fly))
+    except ConfigError:  # the other trials would have it too
+        raise
+    except Exception as error:  # noqa: BLE001 - such as physics that diverge: this world's failure, and no other's
+        return Outcome(seed, False, _in_words(error), "", drawn.words)
     verdict = script.judge(result.flight, result.failure, drawn.world)
     samples = result.flight.samples
     most = max((max(sample.truth.tension) for sample in samples), default=0.0)
@@ -266,6 +272,14 @@ def fly_one(file: str, settings: tuple[str, ...], seed: int, scenario: str = "pe
         harm.append(f"a tendon carried {most:.1f} N")
     covered = verdict.held.covered if verdict.held else math.nan
     return Outcome(seed, verdict.success, verdict.reason, "; ".join(harm), drawn.words, covered)
+
+
+def _in_words(error: Exception) -> str:
+    """What ended a flight, of a group the first one."""
+    first: BaseException = error
+    while isinstance(first, BaseExceptionGroup):
+        first = first.exceptions[0]
+    return str(first) if isinstance(first, ArmError) else f"{in_words(first)} ({place(first)})"
 
 
 def fly(

@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 from arm_companion.__main__ import main
 from arm_companion.arm.parameters import ArmParameters
 from arm_companion.config import load
+from arm_companion.errors import ModelError
 from arm_companion.sim import trials
 from arm_companion.sim.judges import SCENARIOS
+from arm_companion.sim.plant import Plant
 from arm_companion.sim.trials import MODEL_ERROR, Outcome, Summary, draw, kind, wilson
 from arm_companion.sim.world import World
 
@@ -164,6 +166,26 @@ def test_what_a_process_raises_is_seen_here() -> None:
     """Two processes that fail at once: what they raise is seen here, and no process is left behind."""
     with pytest.raises(Exception, match="no_such_key"):
         trials.fly("sim.toml", ["sim.no_such_key=1"], range(2), 2)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (ModelError("the plant diverged at 3.120 s"), "the plant diverged at 3.120 s"),
+        (ZeroDivisionError("division by zero"), "ZeroDivisionError: division by zero (arm_companion.sim.world:"),
+    ],
+)
+def test_a_world_whose_flight_raises_has_failed_for_that_reason(
+    error: Exception, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def diverge(*_: Any) -> None:
+        raise error
+
+    monkeypatch.setattr(Plant, "step", diverge)
+    outcome = trials.fly_one("sim.toml", (), 3)
+    assert (outcome.seed, outcome.success, outcome.harm) == (3, False, "")
+    assert outcome.reason.startswith(reason)
+    assert outcome.words == draw(CONFIG, 3).words
 
 
 def test_sigterm_ends_the_processes_that_fly_too(tmp_path: Path) -> None:
