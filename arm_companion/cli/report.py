@@ -14,7 +14,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of `arm-companion report`."""
     parser.add_argument("log", type=Path, metavar="LOG", help="a record (*.mcap); the parts that follow it come along")
     parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="for report.html and the PNGs (default: LOG without .mcap)"
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="for report.html and the PNGs (default: LOG without .mcap, or LOG-report)",
     )
     parser.add_argument("--truth", type=Path, metavar="FILE", help="the simulator's truth (default: beside LOG)")
     parser.add_argument("--title", help="headline of the page (default: the record's name)")
@@ -44,9 +47,13 @@ def run(arguments: argparse.Namespace) -> int:
             record.remarks.append(str(error))
     flight = read(record, truth)
     verdict = judge(flight)
-    output: Path = arguments.output or log.with_suffix("")
+    output: Path = arguments.output or _beside(log)
     drawn = pictures(flight)
     file = output / "report.html"
+    written = (file, *(output / f"{picture.name}.png" for picture in drawn))
+    if any(path.exists() and path.samefile(log) for path in written):
+        print(f"arm-companion report: {log} would be overwritten; name another folder with --output", file=sys.stderr)
+        return 1
     try:
         output.mkdir(parents=True, exist_ok=True)
         for picture in drawn:
@@ -64,3 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"  {point}")
         print(file)
     return 0
+
+
+def _beside(log: Path) -> Path:
+    """Where the page of a record goes: a name of its own even where the record's has no ending to leave out."""
+    return log.with_suffix("") if log.suffix == ".mcap" else log.with_name(f"{log.name}-report")

@@ -324,6 +324,32 @@ def test_a_record_that_was_cut_off_still_makes_a_page(tmp_path: Path, capsys: py
     assert any("cut off" in point for point in found["points"])
 
 
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [("flight", "flight-report"), ("flight.v2", "flight.v2-report"), ("a.b.mcap", "a.b"), (".mcap", ".mcap-report")],
+)
+def test_a_page_has_a_folder_of_its_own_whatever_the_record_is_called(tmp_path: Path, name: str, folder: str) -> None:
+    path = tmp_path / name
+    copy(path, upto=30)
+    before = path.read_bytes()
+    assert main(["report", str(path)]) == 0
+    assert (tmp_path / folder / "report.html").is_file()
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", ["report.html", "force.png"])
+def test_a_record_is_never_overwritten_by_its_page(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / name
+    copy(path, upto=30)
+    before = path.read_bytes()
+    assert main(["report", str(path), "--output", str(tmp_path)]) == 1
+    assert "would be overwritten" in capsys.readouterr().err
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
 def altered(target: Path, change: Callable[[int, dict[str, Any], dict[str, Any]], None], cycles: int) -> None:
     """The golden flight's beginning, at 100 Hz and changed."""
     reader = Reader(GOLDEN)
