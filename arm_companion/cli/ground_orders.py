@@ -5,6 +5,7 @@ import asyncio
 import contextlib
 import dataclasses
 import math
+import re
 import signal
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -15,7 +16,7 @@ from arm_companion.clock import ticks
 from arm_companion.errors import ArmError
 from arm_companion.ground.arm import Arm
 from arm_companion.ground.channel import ArmSilent
-from arm_companion.ground.commands import CommandFailed
+from arm_companion.ground.commands import RESULTS, CommandFailed
 from arm_companion.ground.jog import HELP, PERIOD_S, WATCHDOG_S, Jog, keyboard
 from arm_companion.ground.parameters import Parameter
 from arm_companion.ground.reports import Status
@@ -26,6 +27,9 @@ from arm_companion.protocol.dialect import mav
 _FOLLOWS_S: Final = 2.0
 _STILL: Final = math.radians(1.0)
 _STATUS_S: Final = 0.3
+_ANSWER: Final = re.compile(f"[A-Z_]+ ({'|'.join(RESULTS.values())}): ")
+_ANSWER_S: Final = 1.0
+"""A command's end follows the sentence that tells why, or the other way round, by less than this."""
 _WHILE_HEARD: Final = """It lasts while the arm hears this station, which ends with this program: without another one
 of the same ids, such as `arm-companion ground watch`, it is lost after mavlink.control_timeout_s (10 s)."""
 _LEAVE: Final = 3
@@ -123,6 +127,8 @@ async def _abort(arguments: argparse.Namespace, arm: Arm) -> None:
 
 async def _repeat_texts(arguments: argparse.Namespace, arm: Arm) -> None:
     async for text in arm.stream(Text, patient=True):
+        if _ANSWER.match(text.text):  # an order of ours ends with it, and then says so itself
+            await asyncio.sleep(_ANSWER_S)
         say(arguments, f"  {text.severity}: {text.text}")
 
 

@@ -285,6 +285,43 @@ def test_clearing_errors_may_take_its_time_in_a_state_of_rest(scripted: Any, mak
     assert [m.command for m in scripted.received] == [command]
 
 
+@pytest.mark.parametrize("early", [True, False])
+def test_a_refused_order_is_shown_once(scripted: Any, capsys: pytest.CaptureFixture[str], early: bool) -> None:
+    def script(message: Message) -> None:
+        if early:
+            scripted.text("PERCH denied: no bar is known")
+        scripted.ack(message.command, DENIED)
+        if not early:
+            asyncio.get_running_loop().call_later(0.2, scripted.text, "PERCH denied: no bar is known")
+
+    scripted.script = script
+    arguments = argparse.Namespace(action="perch", json=False, timeout=None, bar=None, hang=False)
+    assert scripted.run(lambda: ground_orders.ACTIONS["perch"](arguments, scripted.arm)) == 1
+    out, err = capsys.readouterr()
+    assert err == "arm-companion ground: PERCH denied: no bar is known\n"
+    assert out == ""
+
+
+def test_a_refusal_of_another_stations_order_is_shown_while_ours_goes_on(
+    scripted: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scripted.script = lambda m: scripted.ack(m.command, IN_PROGRESS)
+
+    async def main() -> None:
+        arguments = argparse.Namespace(action="perch", json=False, timeout=None, bar=None, hang=False)
+        perching = asyncio.create_task(ground_orders.ACTIONS["perch"](arguments, scripted.arm))
+        await asyncio.sleep(1.0)
+        scripted.text("STOW denied: 255/190 has control")
+        scripted.text("tendon 1 is warm")
+        await asyncio.sleep(3.0)
+        scripted.ack(PERCH, ACCEPTED)
+        assert await perching == 0
+
+    scripted.run(main)
+    out, _ = capsys.readouterr()
+    assert out.index("warning: STOW denied: 255/190") < out.index("warning: tendon 1 is warm") < out.index("PERCH done")
+
+
 @pytest.mark.parametrize(("verb", "told"), [("take", True), ("take-over", True), ("release", False)])
 def test_who_takes_control_is_told_that_it_ends_with_the_program(
     scripted: Any, capsys: pytest.CaptureFixture[str], verb: str, *, told: bool
