@@ -12,6 +12,7 @@ from arm_companion.arm.model import ArmSolution, HoldKind, Payload
 from arm_companion.arm.parameters import ArmParameters, Guides
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.config import Config
+from arm_companion.errors import ModelError
 from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array, frozen, sealed
 from arm_companion.geometry.se3 import Pose
@@ -50,11 +51,33 @@ def goals(
         parameters: the arm.
         theta_deg: bend of its segment, or of each from base to tip; those not named stay straight.
         delta_deg: bending plane, likewise.
+
+    Raises:
+        ModelError: no tendon could be on the inside of such a bend.
     """
     u = np.zeros(2 * len(parameters.segments))
     asked = bend(theta_deg, delta_deg)
     u[: asked.size] = asked
+    _check_sharpness(parameters, u)
     return statics.pull_for_bend(replace(parameters, guides=Guides.CONTINUOUS), u)
+
+
+def _check_sharpness(parameters: ArmParameters, u: Array) -> None:
+    """Refuse bends with a radius under the tendons' own, in words about the bend; the solver knows of radii alone.
+
+    Raises:
+        ModelError: of the first segment that is asked too much.
+    """
+    for k, segment in enumerate(parameters.segments):
+        taken = float((parameters.H[:, 2 * k : 2 * k + 2] @ u[2 * k : 2 * k + 2]).max())  # of the tendon inside, m
+        if taken < segment.L:
+            continue
+        theta = math.degrees(math.hypot(*u[2 * k : 2 * k + 2]))
+        which = f" of segment {k + 1}" if len(parameters.segments) > 1 else ""
+        raise ModelError(
+            f"a bend{which} of {theta:.6g} deg is too sharp: at {theta * segment.L / taken:.0f} deg in that plane "
+            "nothing is left of the tendon on its inside"
+        )
 
 
 def field(config: Config, *, on: bool, attitude_deg: Sequence[float] | None = None) -> Array:

@@ -145,10 +145,10 @@ def _curve(
     mu: float,
     schedule: Iterable[tuple[int, bool, float]],
 ) -> Curve:
-    pull = goals(model.parameters, bend_deg)
     readings: list[Reading] = []
     initial = math.nan
     try:
+        pull = goals(model.parameters, bend_deg)
         rest = model.free(pull, gravity)
         give = rest.compliance[:3, :3] @ rest.tip_rotation[:, 0]
         initial = 1 / math.sqrt(float(give @ give))

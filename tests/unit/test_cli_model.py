@@ -180,7 +180,10 @@ def test_base_turns_either_way_mirror_each_other(ask: Asker) -> None:
         (["pose", "--pull-m", 0, 0, 0, 0, "--theta-deg", 5], "not both"),
         (["pose", "--theta-deg", "nan"], "finite"),
         (["pose", "--theta-deg", "1e308"], "up to 1e+09"),
-        (["pose", "--theta-deg", "1e9"], "pitch radius"),
+        (["pose", "--theta-deg", "1e9"], "too sharp"),
+        (["pose", "--theta-deg", 900], "a bend of 900 deg is too sharp: at 716 deg in that plane nothing is left of"),
+        (["clamp", "--theta-deg", 1100, "--delta-deg", 45], "a bend of 1100 deg is too sharp: at 1013 deg"),
+        (["perching", "--theta-deg", -900], "a bend of 900 deg is too sharp"),
         (["deflect", "--force", "1e9", 0, 0], "no equilibrium"),
         (["clamp", "--force", 1, 0, 0], "unrecognized arguments: --force 1 0 0"),
         (["clamp", "--base-move-mm", 0, 0, 10], "nothing says which way"),
@@ -348,3 +351,10 @@ def test_ten_real_guides_in_mujoco(ask: Asker, row: dict[str, Any]) -> None:
         moved[guides] = 1e3 * np.linalg.norm(loaded["tip_position_m"] - ask.json("pose", *arm)["tip_position_m"])
     assert moved["continuous"] == pytest.approx(row["d_cont"], rel=1e-5)
     assert moved["disks"] == pytest.approx(row["d_mujoco"], rel=0.005)
+
+
+def test_a_bend_that_is_too_sharp_leaves_the_others_of_a_test(ask: Asker) -> None:
+    code, out, err = ask.code("stiffness-test", "--bends-deg", 900, 20, "--steps", 1, "--cycles", 1)
+    assert code == 2
+    assert "20 deg" in out
+    assert "900 deg inward: a bend of 900 deg is too sharp" in err
