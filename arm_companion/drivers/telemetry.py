@@ -242,9 +242,14 @@ def stiffness_messages(stamp: int, stiffness: StiffnessReport) -> Iterator[Messa
     C = C + np.triu(C, 1).T
     # metres and radians do not compare: scaled to a unit diagonal, the matrix shows whether it can be inverted
     scale = np.sqrt(np.clip(np.diag(C), 0.0, None))
-    if scale.min() > 0.0 and np.linalg.cond(C / np.outer(scale, scale)) < _WELL_CONDITIONED:
-        inverse = np.linalg.inv(C)
-        yield mav.MAVLink_arm_stiffness_message(stamp, [float(k) for k in inverse[_UPPER]], mav.ARM_MATRIX_STIFFNESS)
+    if not scale.min() > 0.0:
+        return
+    with np.errstate(all="ignore"):
+        scaled = C / scale / scale[:, None]
+        if not np.isfinite(scaled).all() or np.linalg.cond(scaled) >= _WELL_CONDITIONED:
+            return
+        inverse = np.linalg.inv(scaled) / scale / scale[:, None]
+    yield mav.MAVLink_arm_stiffness_message(stamp, [float(k) for k in inverse[_UPPER]], mav.ARM_MATRIX_STIFFNESS)
 
 
 def payload_message(stamp: int, payload: PayloadReport) -> Message:
@@ -307,4 +312,4 @@ def _scaled(value: float, factor: float, lower: int, upper: int) -> int:
     """A number as the integer that goes over the wire; `upper` itself means that it is not known."""
     if not math.isfinite(value):
         return upper
-    return min(max(round(value * factor), lower), upper - 1)
+    return round(min(max(value * factor, lower), upper - 1))

@@ -6,6 +6,8 @@ for noise: one byte is skipped and the search for the next frame goes on, so tha
 false start.
 """
 
+import copy
+import math
 import re
 import struct
 from collections.abc import Callable, Collection
@@ -26,6 +28,7 @@ SIGNATURE_LENGTH: Final = 13
 
 _CRC_INIT: Final = 0xFFFF
 _ANY_MAGIC: Final = re.compile(b"[\xfd\xfe]")
+_FLOAT: Final = struct.Struct("<f")
 _HEADER_V2: Final = struct.Struct("<xBBxBBBHB")  # length, flags, sequence, system, component, id (low, high)
 _HEADER_V1: Final = struct.Struct("<xBBBBB")  # length, sequence, system, component, id
 
@@ -158,17 +161,28 @@ class MavlinkCodec:
     def encode(self, message: Message) -> bytes:
         """One MAVLink 2 frame with the next sequence number.
 
+        A float that 32 bits do not hold goes out as infinite, as IEEE 754 has it, where nobody is asked to act on it.
+
         Raises:
             ProtocolError: when a field does not fit its type; nothing is counted as sent then.
         """
         try:
-            data: bytes = message.pack(self._sender)
+            data = self._packed(message)
         except (struct.error, TypeError, ValueError, OverflowError) as error:
             raise ProtocolError(f"{message.get_type()} cannot be encoded: {error}") from error
         if self.seal is not None:
             data = self.seal(data)
         self._sender.seq = (self._sender.seq + 1) & 0xFF
         self.counters.sent += 1
+        return data
+
+    def _packed(self, message: Message) -> bytes:
+        try:
+            data: bytes = message.pack(self._sender)
+        except OverflowError:  # of floats alone
+            if place_of(type(message), "target_system") >= 0:  # who is addressed gets what was meant, or nothing
+                raise
+            data = _in_single_precision(message).pack(self._sender)
         return data
 
     @property
@@ -292,6 +306,24 @@ class MavlinkCodec:
                 return
             self.counters.lost += gap
         self._sequences[sender] = sequence
+
+
+def _in_single_precision(message: Message) -> Message:
+    """The message with what its floats cannot hold as infinite."""
+    fitting = copy.copy(message)
+    for name, kind in zip(message.fieldnames, message.fieldtypes, strict=True):
+        if kind == "float":
+            value = getattr(message, name)
+            setattr(fitting, name, list(map(_single, value)) if isinstance(value, list | tuple) else _single(value))
+    return fitting
+
+
+def _single(value: float) -> float:
+    try:
+        _FLOAT.pack(value)
+    except OverflowError:
+        return math.copysign(math.inf, value)
+    return value
 
 
 def _next_magic(data: bytes, at: int) -> int:
