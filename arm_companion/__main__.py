@@ -3,6 +3,7 @@
 import argparse
 import importlib
 import os
+import signal
 import sys
 from collections.abc import Collection
 
@@ -52,14 +53,16 @@ def main(argv: list[str] | None = None) -> int:
         os.environ.setdefault(name, "1")
     words = sys.argv[1:] if argv is None else argv
     named = next((word for word in words if not word.startswith("-")), "")
-    arguments = command_line([named]).parse_args(words)
     try:
+        arguments = command_line([named]).parse_args(words)
         code: int = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # whoever read our output has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:  # what has an orderly end of its own takes the signal before it gets here
+        if argv is None:  # a process of its own: a second press has nothing left to end
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
         print("arm-companion: interrupted", file=sys.stderr)
         return _INTERRUPTED
     except ConfigError as error:

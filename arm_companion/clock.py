@@ -7,9 +7,12 @@ as fast as the processor allows and the same way every time.
 
 import asyncio
 import selectors
+import signal
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Coroutine
 from dataclasses import dataclass
+from types import FrameType
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -126,10 +129,56 @@ def run_simulated(main: Coroutine[Any, Any, T]) -> T:
     """Run `main` to its end on a fresh loop in simulated time.
 
     Raises:
+        KeyboardInterrupt: Ctrl-C ended it; see `run_real_time`.
         RuntimeError: when all tasks wait and no timer is set, which in real time would hang for ever.
     """
-    with asyncio.Runner(loop_factory=SimulatedLoop) as runner:
-        return runner.run(main)
+    return _run(main, SimulatedLoop)
+
+
+def run_real_time(main: Coroutine[Any, Any, T]) -> T:
+    """Run `main` to its end on a fresh `precise_loop`.
+
+    Ctrl-C cancels it. Pressed again while it winds up, Ctrl-C does nothing more: whoever is impatient, and whatever
+    sends the signal to a process and to its group, would otherwise cut its orderly end short.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C ended it.
+    """
+    return _run(main, precise_loop)
+
+
+def _run(main: Coroutine[Any, Any, T], make_loop: Callable[[], asyncio.AbstractEventLoop]) -> T:
+    in_main_thread = threading.current_thread() is threading.main_thread()  # no other can take signals
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        with asyncio.Runner(loop_factory=make_loop) as runner:
+            return runner.run(main)
+    task: asyncio.Task[T] | None = None
+    presses = 0
+
+    async def whole() -> T:
+        nonlocal task
+        task = asyncio.current_task()
+        if presses:  # while the loop was being made
+            main.close()
+            raise asyncio.CancelledError
+        return await main
+
+    def press(_number: int, _frame: FrameType | None) -> None:
+        nonlocal presses
+        presses += 1
+        if presses == 1 and task is not None:
+            task.get_loop().call_soon_threadsafe(task.cancel)
+
+    signal.signal(signal.SIGINT, press)
+    try:
+        with asyncio.Runner(loop_factory=make_loop) as runner:
+            return runner.run(whole())
+    except asyncio.CancelledError:
+        if presses:
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def unix_now() -> float:

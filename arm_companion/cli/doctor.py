@@ -17,7 +17,7 @@ from typing import Final
 from arm_companion import __version__
 from arm_companion.arm import compiled
 from arm_companion.cli.common import add_config_arguments, load_from
-from arm_companion.clock import Clock, precise_loop, unix_now
+from arm_companion.clock import Clock, run_real_time, unix_now
 from arm_companion.config.layers import SYSTEM_FILE
 from arm_companion.config.schema import Config
 from arm_companion.doctor import arm_checks, config_checks, machine_checks, report, vehicle_checks
@@ -91,8 +91,7 @@ def look(arguments: argparse.Namespace, computer: Machine) -> Subject:
         why = f"the daemon runs (process {daemons[0]}) and has it" if daemons else "not opened: --offline"
         mend = "; its own view: journalctl -u arm-companion, or `arm-companion ground status`" if daemons else ""
         return Subject(computer, config, vehicle=why + mend, servos=why + mend, daemons=daemons)
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        vehicle, servos = runner.run(_listen(config, arguments.patience))
+    vehicle, servos = run_real_time(_listen(config, arguments.patience))
     return Subject(computer, config, vehicle=vehicle, servos=servos)
 
 

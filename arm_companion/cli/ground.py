@@ -1,7 +1,6 @@
 """`arm-companion ground`: a person on the ground, or a script, with an arm that flies."""
 
 import argparse
-import asyncio
 import importlib.util
 import json
 import os
@@ -10,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import Any, Final, TypeAlias
 
 from arm_companion.cli.common import in_words
+from arm_companion.clock import run_real_time
 from arm_companion.errors import ArmError
 
 DONE: Final = 0
@@ -150,7 +150,7 @@ def _with_arm(arguments: argparse.Namespace, action: Action) -> int:
             return await action(arguments, arm)
 
     try:
-        return asyncio.run(main())
+        return run_real_time(main())
     except KeyboardInterrupt:
         return _ended(arguments, INTERRUPTED, "interrupted", "")
     except BrokenPipeError:

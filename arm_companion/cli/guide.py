@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import TypeVar
 
-from arm_companion.clock import precise_loop
+from arm_companion.clock import run_real_time
 from arm_companion.config import Config
 from arm_companion.drivers.servo_bus import ServoBus
 from arm_companion.errors import ArmError, DeviceFault
@@ -123,8 +123,7 @@ def on_the_bench(config: Config, work: Callable[[Rig, ServoBus], Awaitable[T]]) 
         RefusedError: the bus or a servo does not do; one line for people.
         ArmError: what the work raised.
     """
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(_guarded(config, work))
+    return run_real_time(_guarded(config, work))
 
 
 async def _guarded(config: Config, work: Callable[[Rig, ServoBus], Awaitable[T]]) -> T | None:

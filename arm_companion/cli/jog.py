@@ -14,7 +14,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.arm.rod_model import RodModel
 from arm_companion.cli.common import add_config_arguments, load_from
 from arm_companion.cli.keyboard import Keyboard
-from arm_companion.clock import precise_loop, ticks, unix_now
+from arm_companion.clock import run_real_time, ticks, unix_now
 from arm_companion.config import Config
 from arm_companion.drivers.calibrated import Calibrated
 from arm_companion.drivers.servo_bus import ServoBus
@@ -54,8 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     if refusal:
         print(f"arm-companion jog: {refusal}", file=sys.stderr)
         return 2
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        code, last = runner.run(_jog(config, math.radians(arguments.speed_deg_s), torque_off=arguments.torque_off))
+    code, last = run_real_time(_jog(config, math.radians(arguments.speed_deg_s), torque_off=arguments.torque_off))
     with contextlib.suppress(OSError):  # the terminal may be gone
         print(f"arm-companion jog: {last}", file=sys.stderr if code else sys.stdout, flush=True)
     return code

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from arm_companion.app import Daemon, open_configured
 from arm_companion.cli.common import add_config_arguments, add_live_argument, load_from
-from arm_companion.clock import Clock, precise_loop, unix_now
+from arm_companion.clock import Clock, run_real_time, unix_now
 from arm_companion.drivers.computer import ComputerWatch
 from arm_companion.drivers.settings import state_directory, with_kept_changes
 from arm_companion.drivers.standard_services import Power
@@ -52,5 +52,4 @@ def run(arguments: argparse.Namespace) -> int:
             restore()
             manager.close()
 
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        return runner.run(main())
+    return run_real_time(main())

@@ -1,7 +1,6 @@
 """`arm-companion servos`: find, set up and watch the servos. Needs the bus for itself: stop the daemon first."""
 
 import argparse
-import asyncio
 import contextlib
 import dataclasses
 import json
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from arm_companion.cli.common import add_config_arguments, load_from
-from arm_companion.clock import precise_loop, ticks
+from arm_companion.clock import run_real_time, ticks
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers import servo_provision, servo_scan
 from arm_companion.drivers.servo_health import BusCounters, ServoState
@@ -82,8 +81,7 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.tendons = len(whole.servos.ids)
     bauds = list(getattr(arguments, "baud", None) or _bauds(config))
     try:
-        with asyncio.Runner(loop_factory=precise_loop) as runner:
-            code: int = runner.run(_COMMANDS[arguments.what](arguments, config, bauds))
+        code: int = run_real_time(_COMMANDS[arguments.what](arguments, config, bauds))
     except CommandRejected as rejected:
         print(f"arm-companion servos: {rejected}", file=sys.stderr)
         return _REFUSED

@@ -151,7 +151,7 @@ def _no_video(arguments: argparse.Namespace) -> str:
 
 
 def _serve(arguments: argparse.Namespace, config: Config) -> int:
-    from arm_companion.clock import precise_loop  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.clock import run_real_time  # noqa: PLC0415 - after the check for the extra
     from arm_companion.sim.progress import Progress  # noqa: PLC0415
     from arm_companion.sim.runner import serve  # noqa: PLC0415
     from arm_companion.supervisor import stop_on_signals  # noqa: PLC0415
@@ -165,8 +165,7 @@ def _serve(arguments: argparse.Namespace, config: Config) -> int:
         finally:
             restore()
 
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        runner.run(main())
+    run_real_time(main())
     return 0
 
 
@@ -314,15 +313,14 @@ def _simulated(arguments: argparse.Namespace, config: Config, progress: Any, pre
 
 
 def _real_time(arguments: argparse.Namespace, config: Config, progress: Any, prepare: Any, stack: Any) -> Any:
-    from arm_companion.clock import precise_loop  # noqa: PLC0415
+    from arm_companion.clock import run_real_time  # noqa: PLC0415
     from arm_companion.sim.asked import asked  # noqa: PLC0415
     from arm_companion.sim.judges import SCENARIOS  # noqa: PLC0415
     from arm_companion.sim.runner import fly_real_time  # noqa: PLC0415
 
     words, fly = _daemon_words(arguments), SCENARIOS[arguments.scenario].fly
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        log = arguments.output / "daemon.log"
-        result = runner.run(fly_real_time(config, words, log, progress.say, prepare, fly=fly, flown_by=stack))
+    log = arguments.output / "daemon.log"
+    result = run_real_time(fly_real_time(config, words, log, progress.say, prepare, fly=fly, flown_by=stack))
     result.flight.asked = asked(_record_path(arguments))
     return result
 

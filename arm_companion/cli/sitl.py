@@ -1,7 +1,6 @@
 """Options of `arm-companion sim` for real flight stacks: which, where its program is, or where one runs already."""
 
 import argparse
-import asyncio
 import contextlib
 import sys
 from collections.abc import Iterator
@@ -101,7 +100,7 @@ def check_running(arguments: argparse.Namespace) -> int:
     from rich.console import Console  # noqa: PLC0415 - after the check for the extra
     from rich.table import Table  # noqa: PLC0415
 
-    from arm_companion.clock import precise_loop  # noqa: PLC0415
+    from arm_companion.clock import run_real_time  # noqa: PLC0415
     from arm_companion.sim.operator_link import OperatorLink  # noqa: PLC0415
     from arm_companion.sim.progress import Progress  # noqa: PLC0415
     from arm_companion.sim.sitl_check import Check, CheckFailed  # noqa: PLC0415
@@ -120,8 +119,7 @@ def check_running(arguments: argparse.Namespace) -> int:
                 return str(error)
         return ""
 
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        failure = runner.run(main())
+    failure = run_real_time(main())
     table = Table(title=f"{arguments.sitl} at {arguments.sitl_connect}", title_justify="left", show_header=False)
     for row in checks.findings.lines():
         table.add_row(*row)

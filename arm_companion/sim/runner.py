@@ -22,6 +22,7 @@ from arm_companion.record import open_recorder
 from arm_companion.record.recorder import Both, MemoryRecorder, Record
 from arm_companion.sim.flight import Flight
 from arm_companion.sim.operator_link import OperatorLink
+from arm_companion.sim.orphans import end_with_parent
 from arm_companion.sim.plant import Pose
 from arm_companion.sim.scenario import Operator, Say
 from arm_companion.sim.servo_emulator import EmulatedBus
@@ -247,6 +248,7 @@ async def _daemon_process(arguments: Sequence[str], log: Path) -> AsyncIterator[
             stdout=stream,
             stderr=stream,
             env=dict(os.environ),
+            preexec_fn=end_with_parent,
         )
         try:
             yield process

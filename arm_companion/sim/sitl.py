@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Protocol
@@ -25,6 +26,7 @@ from arm_companion.config.schema import Config
 from arm_companion.errors import ArmError, ConfigError
 from arm_companion.sim import sitl_ardupilot, sitl_px4
 from arm_companion.sim.capture import Capture, CaptureLine
+from arm_companion.sim.orphans import end_with_parent
 from arm_companion.sim.ports import RigidState, RotorCommand
 from arm_companion.sim.sitl_relay import Relay
 from arm_companion.supervisor import ending_on_terminate
@@ -338,6 +340,7 @@ def _started(how: Launch, directory: Path, log: Path) -> Iterator[subprocess.Pop
                 stdout=stream,
                 stderr=stream,
                 start_new_session=True,
+                preexec_fn=partial(end_with_parent, signal.SIGKILL),  # noqa: PLW1509 - one system call
             )
         except OSError as error:
             raise SitlFailed(f"{how.command[0]} does not start: {error.strerror}") from error

@@ -21,6 +21,7 @@ from arm_companion.clock import run_simulated
 from arm_companion.config import Config, load
 from arm_companion.errors import ArmError, ConfigError, in_words, place
 from arm_companion.sim.judges import SCENARIOS
+from arm_companion.sim.orphans import end_with_parent
 from arm_companion.sim.runner import fly_simulated
 
 MODEL_ERROR = 0.1
@@ -306,7 +307,7 @@ def fly(
     spawn = multiprocessing.get_context("spawn")
     outcomes: list[Outcome] = []
     others = set(multiprocessing.active_children())
-    with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn) as pool:
+    with ProcessPoolExecutor(min(jobs, len(seeds)), mp_context=spawn, initializer=end_with_parent) as pool:
         waiting = [pool.submit(fly_one, file, tuple(settings), seed, scenario) for seed in seeds]
         try:
             for done in as_completed(waiting):

@@ -142,6 +142,7 @@ def test_a_command_too_early_is_rejected_with_the_reason_in_words(world: World) 
 def test_bytes_that_are_no_messages_are_survived_on_both_links(world: World) -> None:
     noise = random.Random(7)
     for size in (1, 7, 60, 280, 1400):
+        world.station.hear(ARM, "HEARTBEAT", 15.0)  # what came before has been read: a socket holds only so much
         for _ in range(20):
             world.station.raw(ARM, noise.randbytes(size))
             world.station.raw(ARM, b"\xfd" + noise.randbytes(size))
@@ -257,6 +258,66 @@ def test_a_bad_configuration_ends_with_code_78_and_says_what_is_allowed() -> Non
     assert "0.002 to 0.5 m" in text
 
 
+def on_ports_of_its_own(folder: Path) -> list[str]:
+    """Settings with which a simulated flight meets no other."""
+    ports = [free_port() for _ in range(3)]
+    words = []
+    for setting in (
+        f"links.autopilot.url=udpin:127.0.0.1:{ports[0]}",
+        f"sim.autopilot_url=udpout:127.0.0.1:{ports[0]}",
+        f"sim.operator_autopilot_url=udpin:127.0.0.1:{ports[1]}",
+        f"links.ground.url=udpout:127.0.0.1:{ports[2]}",
+        f"sim.operator_arm_url=udpin:127.0.0.1:{ports[2]}",
+        f"servos.port={folder / 'bus'}",
+    ):
+        words += ["--set", setting]
+    return words
+
+
+def running(words: list[str]) -> list[str]:
+    """Processes with all of these words on their command lines."""
+    found = []
+    for place in Path("/proc").glob("[0-9]*/cmdline"):
+        with contextlib.suppress(OSError):
+            line = place.read_bytes().decode(errors="replace").replace("\0", " ")
+            found += [line] if all(word in line for word in words) else []
+    return found
+
+
+@pytest.mark.parametrize("presses", [1, 3])
+def test_ctrl_c_ends_a_flight_in_order_however_often_it_is_pressed(tmp_path: Path, presses: int) -> None:
+    words = [sys.executable, "-m", "arm_companion", "sim", "perch", "--output", str(tmp_path)]
+    words += on_ports_of_its_own(tmp_path)
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as flight:
+        assert flight.stdout is not None
+        while "READY" not in flight.stdout.readline():
+            assert flight.poll() is None
+        for _ in range(presses):
+            flight.send_signal(signal.SIGINT)
+            time.sleep(0.05)
+        _, said = flight.communicate(timeout=20.0)
+    assert said == "arm-companion: interrupted\n"
+    assert flight.returncode == 130
+    assert running(["arm_companion", "run", str(tmp_path)]) == []
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process of its parent's end")
+def test_a_flight_that_is_killed_takes_its_daemon_with_it(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "arm_companion", "sim", "perch", "--output", str(tmp_path)]
+    words += on_ports_of_its_own(tmp_path)
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as flight:
+        assert flight.stdout is not None
+        while "READY" not in flight.stdout.readline():
+            assert flight.poll() is None
+        daemon = ["arm_companion", "run", str(tmp_path)]
+        assert len(running(daemon)) == 1
+        flight.kill()
+    until = time.monotonic() + 20.0
+    while running(daemon):
+        assert time.monotonic() < until, "the daemon flies on alone"
+        time.sleep(0.1)
+
+
 def test_a_daemon_that_ends_early_is_told_in_one_line_and_not_as_a_traceback(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "arm_companion", "sim", "world", "--output", str(tmp_path)]
     settings = {
@@ -283,17 +344,7 @@ def test_a_flight_ends_as_soon_as_the_machine_is_hopelessly_behind(
         advance(late)
 
     monkeypatch.setattr(Simulated, "_advance", slow)
-    ports = [free_port() for _ in range(3)]
-    words = ["sim", "perch", "--output", str(tmp_path)]
-    for setting in (
-        f"links.autopilot.url=udpin:127.0.0.1:{ports[0]}",
-        f"sim.autopilot_url=udpout:127.0.0.1:{ports[0]}",
-        f"sim.operator_autopilot_url=udpin:127.0.0.1:{ports[1]}",
-        f"links.ground.url=udpout:127.0.0.1:{ports[2]}",
-        f"sim.operator_arm_url=udpin:127.0.0.1:{ports[2]}",
-        f"servos.port={tmp_path / 'bus'}",
-    ):
-        words += ["--set", setting]
+    words = ["sim", "perch", "--output", str(tmp_path), *on_ports_of_its_own(tmp_path)]
     begun = time.monotonic()
     assert main(words) == TOO_SLOW
     assert time.monotonic() - begun < 25.0

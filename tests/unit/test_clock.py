@@ -1,10 +1,16 @@
 """Simulated time jumps, and the ticker keeps its phase and never bursts."""
 
 import asyncio
+import signal
+from collections.abc import Callable, Coroutine
+from typing import Any
 
 import pytest
 
-from arm_companion.clock import Clock, run_simulated, ticks
+from arm_companion.clock import Clock, run_real_time, run_simulated, ticks
+
+Run = Callable[[Coroutine[Any, Any, None]], None]
+both = pytest.mark.parametrize("run", [run_real_time, run_simulated])
 
 
 def test_an_hour_of_waiting_takes_no_time_and_ends_at_the_hour() -> None:
@@ -77,3 +83,49 @@ def test_unix_stamps_do_not_follow_a_step_of_the_wall_clock() -> None:
         return clock.unix(clock.now()) - first
 
     assert run_simulated(main()) == pytest.approx(2.5)
+
+
+@both
+def test_ctrl_c_cancels_and_pressed_again_does_not_cut_the_orderly_end_short(run: Run) -> None:
+    ended = []
+
+    async def main() -> None:
+        signal.raise_signal(signal.SIGINT)
+        try:
+            await asyncio.sleep(60.0)
+        finally:
+            for _ in range(2):
+                signal.raise_signal(signal.SIGINT)
+                await asyncio.sleep(0.01)
+            ended.append("in order")
+
+    handler = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        run(main())
+    assert ended == ["in order"]
+    assert signal.getsignal(signal.SIGINT) is handler is signal.default_int_handler
+
+
+@both
+def test_what_is_cancelled_otherwise_is_no_ctrl_c(run: Run) -> None:
+    async def main() -> None:
+        raise asyncio.CancelledError
+
+    with pytest.raises(asyncio.CancelledError):
+        run(main())
+
+
+@both
+def test_a_signal_that_somebody_else_takes_is_left_to_them(run: Run) -> None:
+    taken = []
+
+    async def main() -> None:
+        signal.raise_signal(signal.SIGINT)
+        await asyncio.sleep(0.01)
+
+    before = signal.signal(signal.SIGINT, lambda number, _: taken.append(number))
+    try:
+        run(main())
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert taken == [signal.SIGINT]

@@ -14,7 +14,7 @@ import serial
 
 from arm_companion.__main__ import main
 from arm_companion.cli import servos as command
-from arm_companion.clock import SimulatedLoop, run_simulated
+from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import ServoState
@@ -91,7 +91,7 @@ class Bench:
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     bench = Bench()
     monkeypatch.setattr(command, "open_bus", bench.open_bus)
-    monkeypatch.setattr(command, "precise_loop", SimulatedLoop)
+    monkeypatch.setattr(command, "run_real_time", run_simulated)
     return bench
 
 
