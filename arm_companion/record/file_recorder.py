@@ -12,24 +12,20 @@ import secrets
 import sys
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final, NamedTuple
-
-import orjson
+from typing import Final
 
 from arm_companion.config.schema import Config, RecordConfig
 from arm_companion.config.table import as_table
 from arm_companion.mission.facts import Notice
 from arm_companion.record import storage
+from arm_companion.record.batch import Batch, WrittenCycle, in_words
 from arm_companion.record.mcap_file import McapFile
 from arm_companion.record.recorder import FailedCycle, Frame, Record, Recorder
 from arm_companion.record.starts import starts_text
 from arm_companion.record.topics import (
-    COMMANDS,
     CONFIGURATION,
     FACTS,
-    FAILURES,
     LOG,
     RAW,
     STARTS,
@@ -38,7 +34,6 @@ from arm_companion.record.topics import (
     log_message,
     transition,
 )
-from arm_companion.record_codec import plain
 
 log = logging.getLogger(__name__)
 
@@ -59,35 +54,6 @@ _AT_ONCE: Final = 10
 _BREATH_S: Final = 0.001
 """Pause after each batch of a longer backlog, and while the queue of a patient recorder is full."""
 _MB: Final = 1_000_000
-
-
-class _Cycle(NamedTuple):
-    """Facts, memory, and commands or failure of a cycle, as they stand in the file."""
-
-    sequence: int
-    t: float
-    facts: bytes
-    state: bytes
-    topic: str
-    outcome: bytes
-    starts: bytes
-
-
-@dataclass(slots=True)
-class _Batch:
-    """A few cycles, and what came since the ones before."""
-
-    configs: list[tuple[float, Config]] = field(default_factory=list)
-    notices: list[tuple[float, Notice]] = field(default_factory=list)
-    frames: list[Frame] = field(default_factory=list)
-    cycles: list[_Cycle] = field(default_factory=list)
-    last: bool = False
-
-    @property
-    def t(self) -> float | None:
-        if self.cycles:
-            return self.cycles[-1].t
-        return next((item[0] for item in (*self.configs, *self.notices)), None)
 
 
 class FileRecorder(Recorder):
@@ -123,8 +89,8 @@ class FileRecorder(Recorder):
         self._unix = unix
         self._patient = patient
         self._open_file = open_file
-        self._queue: collections.deque[_Batch] = collections.deque()
-        self._batch = _Batch()
+        self._queue: collections.deque[Batch] = collections.deque()
+        self._batch = Batch()
         self._records: list[Record | FailedCycle] = []
         self._sequence = 0
         self._starts_at = float("-inf")
@@ -202,29 +168,16 @@ class FileRecorder(Recorder):
                 self._slow = True
                 self._troubles.append("record: the disk is too slow, cycles are missing")
             return
-        batch, self._batch = self._batch, _Batch()
+        batch, self._batch = self._batch, Batch()
         batch.cycles = [cycle for i, record in enumerate(records) if (cycle := self._in_words(first + i, record))]
         self._queue.append(batch)
         if self._slow and len(self._queue) < _QUEUE // 2:
             self._slow = False
             self._troubles.append(f"record: complete again, {self.dropped} cycles are missing")
 
-    def _in_words(self, sequence: int, record: Record | FailedCycle) -> _Cycle | None:
-        stamp = {"t": record.t}
+    def _in_words(self, sequence: int, record: Record | FailedCycle) -> WrittenCycle | None:
         try:
-            if isinstance(record, Record):
-                topic, outcome = COMMANDS, plain(record.commands)
-            else:
-                topic, outcome = FAILURES, {"error": record.error, "where": record.where}
-            return _Cycle(
-                sequence,
-                record.t,
-                orjson.dumps(stamp | plain(record.facts)),
-                orjson.dumps(plain(record.state)),
-                topic,
-                orjson.dumps(stamp | outcome),
-                self._starts(record),
-            )
+            return in_words(sequence, record, self._starts(record))
         except Exception:
             log.exception("record: a cycle could not be put into words")
             self._lose(1)
@@ -252,7 +205,7 @@ class FileRecorder(Recorder):
     def close(self) -> None:
         """Write what is queued; give up on a disk that hangs."""
         self._flush()
-        self._queue.append(_Batch(last=True))
+        self._queue.append(Batch(last=True))
         self._hurry.set()
         self._thread.join(timeout=None if self._patient else 5.0)
         if self._thread.is_alive():
@@ -290,13 +243,18 @@ class FileRecorder(Recorder):
                 self._breath.wait(_BREATH_S)
         return False
 
-    def _take(self, batch: _Batch) -> None:
+    def _take(self, batch: Batch) -> None:
         if batch.configs:
             self._config = batch.configs[-1][1]
         t = batch.t
         if t is None:
             return
         self._now = t
+        if self._file is not None and self._file.size > self._part_mb * _MB:
+            if batch.resumable:
+                self._finish()
+            else:  # it soon comes; a part that could not be replayed alone is worth less than its budget
+                self._starts_at = float("-inf")
         if self._file is None:
             if t < self._retry_at:
                 self._lose(len(batch.cycles))
@@ -309,16 +267,13 @@ class FileRecorder(Recorder):
         if file is None:
             return
         self._write(file, batch)
-        if file.size > self._part_mb * _MB:
-            self._finish()
-            self._next_part(t)
-        elif t - self._synced > _SYNC_S:
+        if t - self._synced > _SYNC_S:
             self._synced = t
             file.sync()
             if storage.free_mb(self._first.parent) < self._options.keep_free_mb:
                 self._make_room(storage.part(self._first, self._parts))
 
-    def _write(self, file: McapFile, batch: _Batch) -> None:
+    def _write(self, file: McapFile, batch: Batch) -> None:
         for t, config in batch.configs:
             self._write_config(file, t, config)
         for t, notice in batch.notices:

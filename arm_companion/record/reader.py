@@ -40,6 +40,7 @@ class Reader:
 
     Attributes:
         versions: metadata of the first part.
+        part: which one of the record that is, from 1.
         remarks: after reading: in words, what is missing or damaged.
 
     Raises:
@@ -50,9 +51,14 @@ class Reader:
         self.path = path
         self.remarks: list[str] = []
         self.versions = _versions(path)
-        part = self.versions.get("part", "1")
-        if part != "1":
-            self.remarks.append(f"this is part {part} of a record: what came before is not looked at")
+        self.part = _number(self.versions.get("part", "1"))
+
+    def begins(self, cycle: int) -> list[str]:
+        """What is to be said of a record whose first cycle has this number."""
+        if self.part != 1:
+            what = f"this is part {self.part} of a record, which begins with cycle {cycle} of the flight"
+            return [f"{what}: what came before is not looked at"]
+        return [f"its first {cycle} cycles are missing"] if cycle else []
 
     def __iter__(self) -> Iterator[Item]:
         """All messages."""
@@ -123,6 +129,10 @@ def truth_beside(path: Path) -> Path:
     return path.with_name(f"{path.stem}.truth.mcap")
 
 
+def _number(text: str) -> int:
+    return int(text) if text.isdecimal() else 1
+
+
 def _content(chunk: Chunk) -> bytes:
     """The records inside a chunk, still as bytes; raises whatever damaged ones lead to."""
     stream, length = get_chunk_data_stream(chunk, validate_crc=True)
@@ -165,7 +175,9 @@ def _versions(path: Path) -> dict[str, str]:
     try:
         stream = path.open("rb")
     except OSError as error:
-        raise RecordError(f"{path}: cannot be read: {error.strerror}") from None
+        left = storage.oldest_left(path) if isinstance(error, FileNotFoundError) else None
+        hint = f"; the oldest part that is left is {left.name}" if left else ""
+        raise RecordError(f"{path}: cannot be read: {error.strerror}{hint}") from None
     with stream:
         try:
             for record in StreamReader(stream, emit_chunks=True, record_size_limit=_LARGEST).records:

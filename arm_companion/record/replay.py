@@ -108,6 +108,7 @@ class Greatest:
 class Outcome:
     """What a replay found."""
 
+    begins: int = 0  # number of the first cycle, counted over the whole flight
     cycles: int = 0
     same: int = 0
     failures: list[tuple[int, str]] = field(default_factory=list)  # cycle, and what today's code raised
@@ -151,7 +152,7 @@ def replay(reader: Reader, *, change: Change | None = None, mechanics: str = "")
             runner.take(found)
         else:
             runner.configure(found)
-    outcome.remarks += reader.remarks
+    outcome.remarks += [*reader.begins(outcome.begins), *reader.remarks]
     if not outcome.cycles:
         raise RecordError(f"{reader.path}: {'; '.join([*reader.remarks, 'it has no whole cycle'])}")
     if outcome.identical:
@@ -283,8 +284,7 @@ class Runner:
         """Memory as recorded: at the first cycle, and where some are missing."""
         if self.state is None:
             self.start = self.start or cycle.t
-            if cycle.number:
-                self._outcome.remarks.append(f"its first {cycle.number} cycles are missing")
+            self._outcome.begins = cycle.number
         else:
             self._outcome.gaps.append((self._next, cycle.number - self._next))
         try:

@@ -11,6 +11,7 @@ import functools
 import itertools
 import multiprocessing
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
@@ -36,7 +37,8 @@ def replay_in_shares(path: Path, mechanics: str = "") -> Outcome | None:
     processes = min(os.cpu_count() or 1, _MOST)
     if processes == 1 or not path.is_file() or path.stat().st_size < _WORTH_BYTES:
         return None
-    count = Reader(path).count(FACTS)
+    reader = Reader(path)
+    count = reader.count(FACTS)
     if count is None:
         return None
     work = functools.partial(share, path, mechanics)
@@ -45,12 +47,14 @@ def replay_in_shares(path: Path, mechanics: str = "") -> Outcome | None:
         for part in pool.imap_unordered(work, stretches(count, processes)):
             if part is None:
                 return None
+            whole.begins = part.begins
             whole.cycles += part.cycles
             whole.same += part.same
             whole.seconds = max(whole.seconds, part.seconds)
             whole.recorded += part.recorded
     whole.recorded.sort(key=_when)
     whole.now = list(whole.recorded)
+    whole.remarks = reader.begins(whole.begins)
     return whole if whole.cycles == count else None
 
 
@@ -59,7 +63,10 @@ def _when(move: Moved) -> float:
 
 
 def stretches(count: int, processes: int) -> list[tuple[int, int]]:
-    """About the first cycle of each process and of the next one, which begin where a start is recorded."""
+    """About the first cycle of each process and of the next one, counted in what is read.
+
+    They begin where a start is recorded.
+    """
     return list(itertools.pairwise(round(count * k / processes) for k in range(processes + 1)))
 
 
@@ -69,7 +76,8 @@ def share(path: Path, mechanics: str, stretch: tuple[int, int]) -> Outcome | Non
     Args:
         path: of the record.
         mechanics: as for `replay`.
-        stretch: about its first cycle, and the next process': the first one there whose start is recorded.
+        stretch: about its first cycle, and the next process', counted from the first that is read: the first one
+            there whose start is recorded.
     """
     first, end = stretch
     try:
@@ -77,26 +85,41 @@ def share(path: Path, mechanics: str, stretch: tuple[int, int]) -> Outcome | Non
         recorded = reader.versions.get("mechanics", "numpy")
         outcome = Outcome()
         runner = Runner(outcome, None, mechanics_of(mechanics or recorded, recorded, outcome.why))
-        started, expected = False, None
-        for found in written(reader):
+        started, base = False, -1
+        for found in _unbroken(reader):
             if isinstance(found, Config):
                 runner.configure(found)
                 continue
-            if found.failure or found.number != (0 if expected is None else expected):
-                return None
-            if expected is None:
-                runner.start = cycle_of(found).t
-            expected = found.number + 1
+            if base < 0:
+                base = found.number
+                runner.start, first, end = cycle_of(found).t, base + first, base + end
             if started and found.number >= end and found.starts:
+                outcome.begins = base
                 return outcome if _as_recorded(runner, found) else None
-            started = started or found.number == first == 0 or (found.number >= first and bool(found.starts))
+            started = started or found.number == first == base or (found.number >= first and bool(found.starts))
             if started:
                 runner.take(cycle_of(found))
                 if not outcome.identical:
                     return None
     except (ArmError, LookupError, TypeError, ValueError):  # memory of another version, or none, has any of these
         return None
-    return None if reader.remarks else outcome
+    outcome.begins = base
+    return None if reader.remarks or base < 0 else outcome
+
+
+def _unbroken(reader: Reader) -> Iterator[Written | Config]:
+    """What is written, of a record from its part's beginning.
+
+    Raises:
+        ValueError: a cycle is missing, or failed in flight.
+    """
+    expected = 0 if reader.part == 1 else None
+    for found in written(reader):
+        if isinstance(found, Written):
+            if found.failure or found.number != (found.number if expected is None else expected):
+                raise ValueError(found.number)
+            expected = found.number + 1
+        yield found
 
 
 def _as_recorded(runner: Runner, next_one: Written) -> bool:

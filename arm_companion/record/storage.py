@@ -24,6 +24,16 @@ def following(path: Path) -> Path:
     return path.with_name(f"{match[1]}-{int(match[2]) + 1:03d}{path.suffix}")
 
 
+def oldest_left(first: Path) -> Path | None:
+    """The first of a record's parts that still is there, once its first one was deleted; None: there is none."""
+    ours = re.compile(re.escape(first.stem) + r"-(\d{3,})" + re.escape(first.suffix))
+    try:
+        found = [(int(match[1]), file) for file in first.parent.iterdir() if (match := ours.fullmatch(file.name))]
+    except OSError:
+        return None
+    return min(found)[1] if found else None
+
+
 def make_room(first: Path, present: Path, part_mb: float, budget_mb: float, keep_free_mb: float) -> list[Path]:
     """Delete the oldest records until budget and free space are kept; the present part stays.
 

@@ -117,8 +117,10 @@ def read(reader: Reader, truth: Reader | None = None) -> RecordedFlight:
         raise RecordError(f"{reader.path}: a record of version {version} that cannot be drawn: {error!r}") from None
     flight.versions = reader.versions
     flight.remarks = [*reader.remarks, *collected.remarks]
-    if reader.versions.get("part", "1") == "1":
+    if reader.part == 1:
         flight.missing += collected.first
+    else:
+        flight.remarks = [*reader.begins(collected.first), *flight.remarks]
     if truth is not None:
         flight.truth = _truth(truth, flight)
     return flight
