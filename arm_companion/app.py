@@ -36,6 +36,7 @@ from arm_companion.drivers.telemetry import Telemetry
 from arm_companion.drivers.timesync import Timesync
 from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import DeviceFault
+from arm_companion.last_writes import wait_for
 from arm_companion.live.feed import Address
 from arm_companion.mission.facts import ArmAction, Bar, Commands, Control, Facts, Notice, Severity
 from arm_companion.mission.mission import SAFE_ACTION, step
@@ -194,13 +195,11 @@ class Daemon:
             except* DeviceFault as faults:
                 log.error("stopping: %s", "; ".join(str(fault) for fault in faults.exceptions))  # noqa: TRY400
             finally:
-                self._recalibration.close()
-                self._calibrated.close()
                 for link in self._links:
                     link.close()
                 self._keys.keep()
-                self._keeper.close()
-                self._recorder.close()
+                ends = (self._recalibration.end, self._calibrated.end, self._keeper.end, self._recorder.end)
+                wait_for([ending for end in ends for ending in end()])
 
     async def _prepare_model(self) -> None:
         """The compiled mechanics from numba's cache, where there are any; links and heartbeats run meanwhile.

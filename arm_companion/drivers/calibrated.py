@@ -8,6 +8,7 @@ from arm_companion.drivers.calibration import TendonCalibration, apply, curves, 
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.servo_setup import ServoInfo
 from arm_companion.drivers.tendons import Tendons
+from arm_companion.last_writes import Ending, wait_for
 from arm_companion.mission.facts import Calibration
 
 
@@ -80,6 +81,10 @@ class Calibrated:
         """The tendons as calibrated, within the limits of `config`, which a parameter can change."""
         return Tendons(self.servos, config.limits, config.arm.pulley_radius_m, self.curves)
 
+    def end(self) -> list[Ending]:
+        """Have it kept where the servos stand; nothing waits here."""
+        return self._log.end(self._servos)
+
     def close(self) -> None:
         """Keep where the servos stand."""
-        self._log.close(self._servos)
+        wait_for(self.end())

@@ -13,6 +13,7 @@ from typing import TypeVar
 from arm_companion.drivers.calibration import VERSION, TendonCalibration, TensionCalibration
 from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.writer import Writer
+from arm_companion.last_writes import Ending, wait_for
 from arm_companion.record_codec import dumps, loads
 
 _log = logging.getLogger(__name__)
@@ -130,13 +131,18 @@ class ParkingLog:
         if self._take(servos):
             self._writing = self._writer.submit(self._save)
 
+    def end(self, servos: Sequence[ServoState] = ()) -> list[Ending]:
+        """Have it written where the servos stand at the end; nothing waits here."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return []
+        self._take(servos)
+        writer.submit(self._save)
+        return writer.end()
+
     def close(self, servos: Sequence[ServoState] = ()) -> None:
         """Write where the servos stand at the end, unless the disk hangs."""
-        if self._writer is not None:
-            self._take(servos)
-            self._writer.submit(self._save)
-            self._writer.close()
-            self._writer = None
+        wait_for(self.end(servos))
 
     def _take(self, servos: Sequence[ServoState]) -> bool:
         """Whether a servo that is known, and stands, stands elsewhere than noted."""

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from arm_companion.drivers.writer import Writer
 from arm_companion.protocol.dialect import mav
 from arm_companion.protocol.mavlink import Message
 
@@ -91,12 +92,17 @@ class ComputerWatch:
     def __init__(self, disk: Path = Path("/"), root: Path = Path("/")) -> None:
         self._disk, self._root = disk, root
         self._before = self._now = Computer()
+        self._looker = Writer("computer")
 
     async def run(self) -> None:
         """Look until cancelled."""
-        while True:
-            self.see(await asyncio.to_thread(look, self._root, self._disk))
-            await asyncio.sleep(_PERIOD_S)
+        try:
+            while True:
+                # not asyncio.to_thread: the loop's end would wait for a look that hangs
+                self.see(await asyncio.wrap_future(self._looker.submit(look, self._root, self._disk)))
+                await asyncio.sleep(_PERIOD_S)
+        finally:
+            self._looker.end()
 
     def see(self, computer: Computer) -> None:
         """Take in a look."""

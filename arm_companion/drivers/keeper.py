@@ -5,13 +5,11 @@ import logging
 import os
 from collections import deque
 from pathlib import Path
-from typing import Final
 
 from arm_companion.drivers.writer import Writer
+from arm_companion.last_writes import Ending
 
 log = logging.getLogger(__name__)
-
-_CLOSE_WITHIN_S: Final = 5.0
 
 
 class Keeper:
@@ -32,12 +30,17 @@ class Keeper:
         """What people should know: of each file once that it is not kept, until it is."""
         return [self._troubles.popleft() for _ in range(len(self._troubles))]
 
+    def end(self) -> list[Ending]:
+        """Have what is left written, and stop; nothing waits here."""
+        return self._writer.end()
+
     def close(self) -> None:
         """Write what is left and stop; give up on a disk that hangs."""
-        self._writer.close(_CLOSE_WITHIN_S)
+        self._writer.close()
 
     def _write(self) -> None:
-        while self._newest:
+        """One file: at the end it shows that the disk gets on."""
+        if self._newest:
             file, data = self._newest.popitem()
             try:
                 write_atomically(file, data)

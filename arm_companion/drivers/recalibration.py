@@ -15,6 +15,7 @@ from arm_companion.drivers.servo_health import ServoState
 from arm_companion.drivers.tendons import Tendons
 from arm_companion.drivers.writer import Writer
 from arm_companion.errors import DeviceFault
+from arm_companion.last_writes import Ending, wait_for
 from arm_companion.mission.facts import Order, Request, Workshop
 from arm_companion.mission.state import CALIBRATES, Phase
 from arm_companion.procedures.tendon_zeros import Zero
@@ -114,10 +115,13 @@ class Recalibration:
         except* DeviceFault as faults:
             _log.debug("torque off: %s", faults.exceptions)
 
+    def end(self) -> list[Ending]:
+        """What is being written, to be waited for."""
+        return [] if self._writer is None else self._writer.end()
+
     def close(self) -> None:
         """Wait for what is being written, but not for a disk that hangs."""
-        if self._writer is not None:
-            self._writer.close()
+        wait_for(self.end())
 
     @property
     def _file(self) -> Path:

@@ -9,11 +9,12 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
-from typing import Final, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
+
+from arm_companion.last_writes import Ending, wait_for
 
 _log = logging.getLogger(__name__)
 
-_CLOSE_WITHIN_S: Final = 2.0  # systemd gives the whole daemon ten
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -25,6 +26,7 @@ class Writer:
         self._name = name
         self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._done = 0
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> "Future[T]":
         """Do `work` soon; the future says what became of it."""
@@ -35,21 +37,31 @@ class Writer:
         self._jobs.put(partial(_do, future, partial(work, *args, **kwargs)))
         return future
 
-    def close(self, within_s: float = _CLOSE_WITHIN_S) -> None:
+    def end(self) -> list[Ending]:
+        """Have the thread do what is left and end; nothing waits here. What is to be waited for, if it ever started."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return []
+        self._jobs.put(None)
+        return [Ending(thread, lambda: self._done, self._tell)]
+
+    def close(self) -> None:
         """Do what is left, and end; give up on a job that hangs."""
-        if self._thread is not None:
-            self._jobs.put(None)
-            self._thread.join(within_s)
-            if self._thread.is_alive():
-                _log.error("%s: the disk does not answer; what is left to be written is lost", self._name)
-            self._thread = None
+        wait_for(self.end())
+
+    def _tell(self, ended: bool) -> None:
+        if not ended:
+            _log.error("%s: the disk does not answer; what is left to be written is lost", self._name)
 
     def _run(self) -> None:
         while (job := self._jobs.get()) is not None:
             job()
+            self._done += 1
 
 
 def _do(future: "Future[T]", work: Callable[[], T]) -> None:
+    if not future.set_running_or_notify_cancel():  # whoever waited for it does so no more
+        return
     try:
         future.set_result(work())
     except BaseException as error:  # noqa: BLE001 - whoever waits gets it

@@ -17,6 +17,7 @@ from typing import Final
 
 from arm_companion.config.schema import Config, RecordConfig
 from arm_companion.config.table import as_table
+from arm_companion.last_writes import Ending
 from arm_companion.mission.facts import Notice
 from arm_companion.record import storage
 from arm_companion.record.batch import Batch, WrittenCycle, in_words
@@ -99,9 +100,12 @@ class FileRecorder(Recorder):
         self._raw_lost = False
         self._troubles: collections.deque[str] = collections.deque(maxlen=16)
         self._slow = False
+        self._ending = False
         # what follows is the thread's alone
         self._file: McapFile | None = None
         self._parts = 0
+        self._done = 0  # batches
+        self._saved = 0  # cycles of the files before the present one
         self._given = 0  # cycles of the present file, or of the one that is to be opened
         self._begun = ""
         self._config: Config | None = None
@@ -202,14 +206,21 @@ class FileRecorder(Recorder):
             texts.append(self._troubles.popleft())
         return texts
 
-    def close(self) -> None:
-        """Write what is queued; give up on a disk that hangs."""
+    def end(self) -> list[Ending]:
+        """See `Recorder`."""
         self._flush()
+        self._ending = True
         self._queue.append(Batch(last=True))
         self._hurry.set()
-        self._thread.join(timeout=None if self._patient else 5.0)
-        if self._thread.is_alive():
-            log.warning("record: the disk does not take the last cycles")
+        return [Ending(self._thread, lambda: self._done, self._tell, self._patient)]
+
+    def _tell(self, ended: bool) -> None:
+        """Log what the disk has cost."""
+        if not ended:
+            file = self._file
+            saved = self._saved + (file.count(FACTS) if file is not None else 0)
+            lost = self._sequence - self.dropped - saved
+            log.error("record: the disk does not answer; the last %d cycles are lost", lost)
         for text in self.troubles():
             log.warning("%s", text)
         if self.dropped:
@@ -237,6 +248,7 @@ class FileRecorder(Recorder):
             except Exception:
                 log.exception("record: cycles could not be written")
                 self._lose(len(batch.cycles))
+            self._done += 1
             if batch.last:
                 return True
             if behind:  # leave the interpreter to the cycle
@@ -269,9 +281,14 @@ class FileRecorder(Recorder):
         self._write(file, batch)
         if t - self._synced > _SYNC_S:
             self._synced = t
+            self._sync(file)
+
+    def _sync(self, file: McapFile) -> None:
+        """Every few seconds: what a power cut would take, and what is left of the disk."""
+        if not self._ending:  # what the kernel has by then it writes without us
             file.sync()
-            if storage.free_mb(self._first.parent) < self._options.keep_free_mb:
-                self._make_room(storage.part(self._first, self._parts))
+        if storage.free_mb(self._first.parent) < self._options.keep_free_mb:
+            self._make_room(storage.part(self._first, self._parts))
 
     def _write(self, file: McapFile, batch: Batch) -> None:
         for t, config in batch.configs:
@@ -337,6 +354,8 @@ class FileRecorder(Recorder):
         except OSError as error:
             self._abandon()
             self._troubles.append(f"record: its last cycles are lost: {error.strerror or error}")
+        else:
+            self._saved += file.count(FACTS)
         self._file, self._given = None, 0
 
     def _abandon(self) -> None:
@@ -346,6 +365,7 @@ class FileRecorder(Recorder):
         if file is not None:
             file.abandon()
             saved = file.count(FACTS)
+            self._saved += saved
             self._parts -= not saved  # a reader looks for part after part, and the next try takes the same file
         self._lose(self._given - saved)
         self._given = 0

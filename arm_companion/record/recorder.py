@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 from arm_companion.config.schema import Config
 from arm_companion.errors import in_words, place
+from arm_companion.last_writes import Ending, wait_for
 from arm_companion.mission.facts import Commands, Facts, Notice
 from arm_companion.mission.state import State
 
@@ -74,8 +75,13 @@ class Recorder:
         """What people should know of the recording itself, once each."""
         return []
 
+    def end(self) -> list[Ending]:
+        """Have what is left written, and stop; nothing waits here. What is to be waited for."""
+        return []
+
     def close(self) -> None:
         """Write what is left and stop."""
+        wait_for(self.end())
 
 
 class MemoryRecorder(Recorder):
@@ -130,7 +136,6 @@ class Both(Recorder):
         """See `Recorder`."""
         return [text for recorder in self._recorders for text in recorder.troubles()]
 
-    def close(self) -> None:
+    def end(self) -> list[Ending]:
         """See `Recorder`."""
-        for recorder in self._recorders:
-            recorder.close()
+        return [ending for recorder in self._recorders for ending in recorder.end()]

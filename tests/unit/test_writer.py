@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from arm_companion import last_writes
 from arm_companion.drivers import calibration_files as files
-from arm_companion.drivers import writer as module
 from arm_companion.drivers.writer import Writer
 
 
@@ -28,7 +28,7 @@ def test_where_servos_stand_is_not_waited_for_on_a_disk_that_hangs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     awake = threading.Event()
-    monkeypatch.setattr(module, "_CLOSE_WITHIN_S", 0.01)
+    monkeypatch.setattr(last_writes, "STALL_S", 0.01)
     monkeypatch.setattr(files, "save", lambda _path, _value: awake.wait(60.0))
     files.ParkingLog(str(tmp_path), {1: 2048}).close()
     assert not awake.is_set()
@@ -38,7 +38,7 @@ def test_where_servos_stand_is_not_waited_for_on_a_disk_that_hangs(
 
 def test_the_interpreter_does_not_wait_for_a_job_that_hangs_either() -> None:
     code = (
-        "import time; from arm_companion.drivers import writer; writer._CLOSE_WITHIN_S = 0.01;"
-        "one = writer.Writer('test'); one.submit(time.sleep, 3600.0); one.close()"
+        "import time; from arm_companion import last_writes; from arm_companion.drivers import writer;"
+        "last_writes.STALL_S = 0.01; one = writer.Writer('test'); one.submit(time.sleep, 3600.0); one.close()"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False, timeout=60.0).returncode == 0
