@@ -96,6 +96,7 @@ class ServoRecord:
     set_up: bool = False
     firmware: int = 0  # 0: not known yet
     vouched: bool = False  # its LED says that its turns are known
+    stood: int | None = None  # ticks, where it was last heard while its turns were known
     _tick_ms: int = 0
     _tick_between: tuple[float, float] = (-math.inf, -math.inf)  # when it was asked for, and when it came
 
@@ -105,6 +106,8 @@ class ServoRecord:
             possible = _JUMP_TICKS + _FASTEST_TICKS_PER_S * (now - self.answered_at)
             if abs(feedback.position - self.feedback.position) > possible:
                 self.turns_lost = True
+        if self.set_up and not self.turns_lost:
+            self.stood = feedback.position
         self.feedback = feedback
         self.answered_at = now
         self.missed = 0

@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from arm_companion.clock import run_simulated
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_bus import ServoBus
-from arm_companion.drivers.servo_health import ServoState
+from arm_companion.drivers.servo_health import ServoRecord, ServoState
 from arm_companion.errors import DeviceFault, LinkError
 from arm_companion.protocol import control_table as ct
-from arm_companion.protocol.control_table import HardwareError
+from arm_companion.protocol.control_table import Feedback, HardwareError
 from arm_companion.sim import servo_faults
 from arm_companion.sim.byte_noise import ByteNoise
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
@@ -40,7 +40,7 @@ class Arm:
         self.emulator = ServoEmulator(config, seed=5)
         self.wire = EmulatedBus(self.emulator, config)
         self.pipe = MemoryPipe(latency_s=0.0001)
-        self.bus = ServoBus(self.pipe.opener(1), config, rng=random.Random(3))
+        self.bus = ServoBus(self.pipe.opener(1), config, rng=random.Random(3), parked_window=128)
         self.states: tuple[ServoState, ...] = ()
         self.serving: asyncio.Task[None] | None = None
 
@@ -272,6 +272,57 @@ def test_turns_that_were_lost_with_the_power_are_found_again_only_when_told(turn
         assert [state.position for state in arm.states] == pytest.approx([HOME + turned] * 4, abs=20)
 
     story(play)
+
+
+@pytest.mark.parametrize(
+    ("stood", "turned", "found"),
+    [
+        (-6270, 0.0, -6270),  # a tendon let out, that hangs slack since
+        (-6270, 40.0, -6230),
+        (-6270, 6270.0, 0),  # a person has wound it up
+        (6804, -6804.0, 0),  # a tendon taken in, that the arm has drawn out as it straightened
+        (4096, -4096.0, 0),  # the same: the angle alone says nothing of a turn
+        (265, -265.0, 0),
+    ],
+)
+def test_a_servo_that_had_no_power_is_found_where_its_tendon_was_let_out_or_else_near_its_zero(
+    stood: int, turned: float, found: float
+) -> None:
+    async def play(arm: Arm) -> None:
+        stands = HOME + arm.config.directions[3] * stood
+        turns = arm.config.directions[3] * turned
+        await arm.run(6.0, stands)
+        arm.emulator[4].set_power(on=False)
+        await arm.run(10.0, stands, until=lambda: arm.states[3].silent)
+        arm.emulator[4].motor.position += turns
+        await arm.run(1.0)
+        arm.emulator[4].set_power(on=True)
+        await arm.run(1.0)
+        assert arm.states[3].turns_lost
+        assert arm.at(stands + turns, {4}), "nothing moved"
+        await arm.meanwhile(arm.bus.recover(), stands)
+        assert arm.states[3].position == pytest.approx(HOME + arm.config.directions[3] * found, abs=20)
+
+    story(play)
+
+
+def test_where_a_servo_stood_is_what_it_said_while_its_turns_were_known() -> None:
+    record = ServoRecord(1, 0)
+
+    def hear(position: int) -> int | None:
+        record.take(Feedback(0, 0, 0, 0, 0, 0, 0, 0)._replace(position=position), 0.01)
+        return record.stood
+
+    assert hear(100) is None, "nobody has decided yet whether it knows its turns"
+    record.set_up = True
+    assert hear(110) == 110
+    assert hear(3000) == 110, "a jump"
+    record.turns_lost = False
+    assert hear(3010) == 3010
+    record.lose_power()
+    assert hear(1000) == 3010
+    record.set_up = True
+    assert hear(1001) == 3010
 
 
 def test_a_brown_out_warns_and_a_deep_one_is_a_loss_of_power() -> None:
