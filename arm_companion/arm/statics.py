@@ -82,7 +82,7 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
     # What rounding of the goals leaves of the moment; tendons far stiffer than the backbone make much of it.
     reach = float(np.abs(H).max())
     rounding = _ROUNDING * float(k.max()) * reach * (float(np.abs(q).max()) + reach) / scale
-    u = np.linalg.lstsq(H, q - q.mean(), rcond=None)[0]
+    u = bend_of_differences(parameters, q)
     tau, residual, excess = stretch_tension(parameters, u, q), np.inf, np.inf
     for _ in range(_ITERATIONS):
         g = bending_moment(parameters, u, tau)
@@ -96,6 +96,12 @@ def bend_for_pull(parameters: ArmParameters, pull: ArrayLike) -> Array:
     if not excess < 0:
         raise NoSolution(residual, "unloaded bend")
     return np.asarray(u)
+
+
+def bend_of_differences(parameters: ArmParameters, pull: ArrayLike) -> Array:
+    """The bend u (2 m,), rad, that the differences of goals (n,), m, ask for, as if no tendon went slack or yielded."""
+    q = np.asarray(pull, dtype=np.float64)
+    return np.asarray(np.linalg.lstsq(parameters.H, q - q.mean(), rcond=None)[0])
 
 
 def buckling_tension(parameters: ArmParameters) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 
 from arm_companion.config.schema import ServosConfig
 from arm_companion.drivers.servo_health import BusCounters, ServoRecord, ServoState, fault_of, raise_together
-from arm_companion.drivers.servo_homing import adopt, doubt, home, nearest_turn
+from arm_companion.drivers.servo_homing import adopt, doubt, home, let_out
 from arm_companion.drivers.servo_link import ServoLink
 from arm_companion.drivers.servo_reader import ServoReader
 from arm_companion.drivers.servo_setup import SPEED_LIMIT_RAD_PER_S, ServoInfo, Settings, set_up, settings_of
@@ -381,21 +381,10 @@ class ServoBus:
         if record.tripped or not record.set_up:
             await self._set_up(record)
         if record.turns_lost:
-            await self.accept_position(record.id, self._let_out(record) if near is None else near)
-
-    def _let_out(self, record: ServoRecord) -> int | None:
-        """Where a servo without power has kept its tendon let out, ticks; None: it is to be expected near its zero.
-
-        The outer tendon of a wrap is let out by more than a turn. When its servo has no power meanwhile, nothing takes
-        that in, and it hangs slack beside the straight arm: its horn is at the angle at which it stood. A horn that
-        had its tendon taken in was turned back by the arm as that straightened.
-        """
-        if record.feedback is None or record.stood is None:
-            return None
-        i = self._config.ids.index(record.id)
-        out = self._config.directions[i] * (self._zeros[record.id] - record.stood)
-        same = abs(nearest_turn(record.feedback.position, record.stood) - record.stood) <= self._parked_window
-        return record.stood if same and out > 0 else None
+            if near is None:
+                direction = self._config.directions[self._config.ids.index(record.id)]
+                near = let_out(record, self._zeros[record.id], direction, self._parked_window)
+            await self.accept_position(record.id, near)
 
     async def _await_boot(self, record: ServoRecord) -> None:
         """Return once a servo answers again, or after as long as that may take."""

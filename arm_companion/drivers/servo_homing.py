@@ -18,6 +18,28 @@ def nearest_turn(position: int, near: int) -> int:
     return position + _TURN * round((near - position) / _TURN)
 
 
+def let_out(record: ServoRecord, zero: int, direction: int, window: int) -> int | None:
+    """Where a servo that lost its turns has kept its tendon let out all along.
+
+    The outer tendon of a wrap is let out by more than a turn. When its servo has no power meanwhile, nothing takes that
+    in, and it hangs slack beside the straight arm: its horn is at the angle at which it stood. A horn that had its
+    tendon taken in was turned back by the arm as that straightened.
+
+    Args:
+        record: of the servo.
+        zero: ticks.
+        direction: +1 where growing positions take in, else -1.
+        window: ticks, whole turns aside, within which it must still stand where it stood.
+
+    Returns:
+        Where it stood, ticks; None: it is to be expected near its zero.
+    """
+    if record.feedback is None or record.stood is None or direction * (record.stood - zero) >= 0:
+        return None
+    moved = nearest_turn(record.feedback.position, record.stood) - record.stood
+    return record.stood if abs(moved) <= window else None
+
+
 async def adopt(link: ServoLink, record: ServoRecord, zero: int, window: int) -> None:
     """Decide at the first meeting whether a servo's count of turns can be believed, and mark those that can.
 

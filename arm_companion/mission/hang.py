@@ -1,7 +1,8 @@
 """The hang perch as rows of the table: from a tested grip of an arm above to motors that idle, and back.
 
 An arm that may carry a vehicle opens for nobody before the motors carry it: every way out of these phases goes
-through TAKE_BACK, which ends by the throttle, and what cannot be taken back is held in HANG_HOLD.
+through TAKE_BACK, which ends by the throttle, and what cannot be taken back is held in HANG_HOLD. With one
+exception: by servos that hold nothing no vehicle hangs, and CLEAR_ERRORS leads out of HANG_HOLD (`refusals`).
 """
 
 import math
@@ -140,7 +141,8 @@ def cannot_open(s: Situation) -> str | None:
 def cannot_take_back(s: Situation) -> str | None:
     """Why the motors cannot take the load back now."""
     if (reason := disarmed(s)) is not None:
-        return f"{reason} and may hang by the arm: arm it first; on the ground, take the servos' power away"
+        away = "on the ground take the servos' power away, then CLEAR_ERRORS"
+        return f"{reason} and may hang by the arm: arm it first; {away}"
     return vehicle_lost(s) or failsafe(s)
 
 

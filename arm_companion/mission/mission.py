@@ -29,6 +29,7 @@ from arm_companion.mission.motion import ZERO
 from arm_companion.mission.notices import TOLD_IN
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.perch import TABLE
+from arm_companion.mission.refusals import mend_first, not_in
 from arm_companion.mission.report import status_report
 from arm_companion.mission.sharing import keep_sharing
 from arm_companion.mission.situation import Situation
@@ -156,7 +157,7 @@ def _obey(s: Situation, request: Request, answers: list[Answer], notices: list[N
             asked = s.remembering(replace(s.state, kind=_kind(request)))
         row = TABLE.order(request.order, phase)
         if row is None:
-            raise CommandRejected(f"{name} is not possible in state {phase.name}")
+            raise CommandRejected(not_in(request.order, phase))
         if (reason := row.refusal(asked)) is not None:
             raise CommandRejected(reason)
         moved = _MOVES[request.order](s, request) if request.order in _MOVES else s.state
@@ -220,7 +221,7 @@ def _finish_clearing(s: Situation, answers: list[Answer]) -> Situation:
     if (fault := s.servo_fault) is None:
         answers.append(Answer(running.request, Result.ACCEPTED, progress=100))
     elif s.t - running.since > _CLEAR_TIMEOUT_S:
-        answers.append(Answer(running.request, Result.FAILED, fault))
+        answers.append(Answer(running.request, Result.FAILED, mend_first(fault)))
     else:
         return s
     return s.remembering(replace(s.state, running=None))

@@ -29,7 +29,7 @@ from arm_companion.mission.hazards import (
 from arm_companion.mission.machine import OrderRow, Table, Transition
 from arm_companion.mission.motion import ZERO, arrived, norm, sub
 from arm_companion.mission.pull_test import pull_test_failed, pull_test_passed, tested_to_hang
-from arm_companion.mission.refusals import cannot_clear, cannot_set_out, may_hold
+from arm_companion.mission.refusals import cannot_clear, cannot_set_out, may_hold, mend_first
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import CARRYING, PerchKind, Phase
 
@@ -232,9 +232,8 @@ def cannot_ready(s: Situation) -> str | None:
     """Why the arm cannot be made ready now."""
     if s.facts.calibration.refusal:  # of a servo that was turned it knows more than the servo's own fault
         return s.facts.calibration.refusal
-    if (fault := s.tendon_fault) is not None:
-        return f"{fault}; mend it, then CLEAR_ERRORS"
-    return s.servo_fault
+    fault = s.tendon_fault or s.servo_fault
+    return None if fault is None else mend_first(fault)
 
 
 def cannot_perch(s: Situation) -> str | None:
@@ -271,7 +270,7 @@ ORDERS: tuple[Ask, ...] = (
     # servos may be rebooted and homed only where nothing hangs on them; `done` is when they are well
     Ask(Order.CLEAR_ERRORS, frozenset({Phase.STARTUP}), Phase.STARTUP, frozenset(), may_hold),
     Ask(Order.CLEAR_ERRORS, STOWED_ONLY, Phase.STOWED, frozenset()),
-    Ask(Order.CLEAR_ERRORS, frozenset({Phase.HOLDING}), Phase.STOWED, frozenset(), cannot_clear),
+    Ask(Order.CLEAR_ERRORS, frozenset({Phase.HOLDING, Phase.HANG_HOLD}), Phase.STOWED, frozenset(), cannot_clear),
     *(Ask(Order.FEEDFORWARD, frozenset({phase}), phase, frozenset({phase})) for phase in Phase),
     *(
         # nothing is under way that could be given up, or it is being given up already

@@ -7,7 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from arm_companion.arm.reaction import GRAVITY
+from arm_companion.arm.statics import bend_of_differences
 from arm_companion.config.schema import Config
+from arm_companion.errors import ModelError
 from arm_companion.geometry.se3 import Pose
 from arm_companion.mission.facts import Bar, Control, Facts, Order, TendonState, Vec3
 from arm_companion.mission.gripper_facts import JawState
@@ -18,6 +20,7 @@ from arm_companion.values import replace
 
 _ABOVE = -0.5  # z of the arm's base axis in body axes
 _NEAR_M = 0.15
+_TINY_RAD = 1e-9
 _COMES_TO_REST_S = 3.0  # of set-points that may get lost
 _ELSEWHERE_M = 0.5  # from where an object was taken: it is set down here, and not brought back
 
@@ -163,9 +166,19 @@ class Situation:
 
     @cached_property
     def bend(self) -> tuple[float, float]:
-        """Bend that the measured displacements stand for, rad."""
-        u = self.parameters.model.bend_for_pull(np.asarray(self.pulls))
-        return float(u[0]), float(u[1])
+        """Bend that the measured displacements stand for, rad.
+
+        Servos that are silent, or lost their turns, may tell displacements that no arm can have. No cycle may fail on
+        them, for orders lead out of that: what counts then is their differences, and no more than an arm may bend.
+        """
+        pulls, model = np.asarray(self.pulls), self.parameters.model
+        try:
+            x, y = model.bend_for_pull(pulls).tolist()
+        except ModelError:
+            x, y = bend_of_differences(model.parameters, pulls).tolist()
+            most = min(self.config.limits.bend_max_rad / max(math.hypot(x, y), _TINY_RAD), 1.0)
+            x, y = most * x, most * y
+        return x, y
 
     @property
     def at_bend_goal(self) -> bool:

@@ -166,9 +166,20 @@ def check_load(before: State, state: State, facts: Facts, commands: Commands) ->
     """An arm that may carry the vehicle does not move, and never opens over stopped motors."""
     if state.phase in SUSPENDED:
         assert commands.arm is ArmAction.HOLD, "an arm that may carry the vehicle does not move"
-    if before.phase in SUSPENDED and state.phase not in SUSPENDED:
+    if (before.phase, state.phase) == (Phase.HANG_HOLD, Phase.STOWED):
+        check_cleared(facts)
+    elif before.phase in SUSPENDED and state.phase not in SUSPENDED:
         assert before.phase is Phase.TAKE_BACK
         assert facts.vehicle.armed, "an arm that carries a vehicle with stopped motors never opens"
+
+
+def check_cleared(facts: Facts) -> None:
+    """Only of an arm that holds nothing is it believed that the vehicle stands, and does not hang."""
+    assert any(request.order is Order.CLEAR_ERRORS for request in facts.requests), "nobody but a person knows"
+    assert facts.vehicle.landed
+    assert not facts.vehicle.armed
+    under_torque = [tendon for tendon in facts.tendons if tendon.torque]
+    assert all(tendon.homed and abs(tendon.pull) < 0.01 for tendon in under_torque), "a wrapped tendon holds"
 
 
 def check_gripper(before: State, state: State, commands: Commands) -> None:

@@ -170,7 +170,10 @@ def test_a_dead_gripper_keeps_the_arm_from_getting_ready(parameters: Parameters,
     run = Run(memory(Phase.STOWED), parameters)
     run.cycle(ask(jaws(silent=True)(hovering()), Order.READY))
     (said,) = run.said[-1].answers
-    assert (said.result, said.reason) == (Result.TEMPORARILY_REJECTED, "gripper: servo does not answer")
+    assert (said.result, said.reason) == (
+        Result.TEMPORARILY_REJECTED,
+        "gripper: servo does not answer; mend it, then CLEAR_ERRORS",
+    )
 
 
 # --- closing, by a servo ---

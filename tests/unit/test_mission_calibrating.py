@@ -169,10 +169,8 @@ def test_it_begins_in_no_other_state(phase: Phase, brisk: Parameters) -> None:
     bench.run = Run(memory(phase, armed=False, control=ON_GROUND.control), brisk)
     bench.order()
     first = bench.answers[0]
-    assert (first.result, first.reason) == (
-        Result.TEMPORARILY_REJECTED,
-        f"CALIBRATE is not possible in state {phase.name}",
-    )
+    assert first.result is Result.TEMPORARILY_REJECTED
+    assert first.reason.startswith(f"CALIBRATE is not possible in state {phase.name}")
 
 
 def changed(parameters: Parameters, change: Callable[[Config], Config]) -> Parameters:

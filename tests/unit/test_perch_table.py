@@ -64,7 +64,8 @@ def test_a_gripping_arm_never_stows_or_departs_without_letting_go_first(phase: P
 @pytest.mark.parametrize("phase", sorted(SUSPENDED, key=lambda p: p.value))
 def test_an_arm_that_may_carry_the_vehicle_leaves_through_the_motors_alone(phase: Phase) -> None:
     after = {target for source, target in edges() if source is phase} - SUSPENDED
-    assert after == ({Phase.UNLOAD} if phase is Phase.TAKE_BACK else set())
+    # CLEAR_ERRORS leads to STOWED, of an arm alone that holds nothing: the law in `check_cleared`
+    assert after == {Phase.TAKE_BACK: {Phase.UNLOAD}, Phase.HANG_HOLD: {Phase.STOWED}}.get(phase, set())
     assert not any(row.fails for row in TABLE.transitions if phase in row.sources and row.target not in SUSPENDED), (
         "it is opened by what the motors do, never by a failure"
     )
