@@ -15,11 +15,13 @@ from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.scenario import Operator, ScenarioFailed
 from arm_companion.sim.world import World
 
+CONFIG = load("sim.toml")
 OUTER = 2
 """Index of the servo whose tendon is let out around the bar, by a turn and a half."""
 _HELD_S = 2.0
 _OFF_S = 3.0
 _BOOTED_S = 1.0
+_TAUT_S = 1.0
 
 
 async def _clear_errors(operator: Operator) -> None:
@@ -58,11 +60,13 @@ def test_a_servo_that_fails_on_the_bar_is_power_cycled_on_the_ground_and_the_arm
         await asyncio.sleep(_BOOTED_S)
         await _clear_errors(operator)
         await operator.ready()
+        await asyncio.sleep(_TAUT_S)
+        assert min(worlds[0].plant.tensions()) > CONFIG.limits.tension_min_n, "a turn nearer to its zero it hangs slack"
         await operator.order(mav.MAV_CMD_ARM_STOW, "STOW", 20.0)
         await operator.wait(lambda: operator.state == "STOWED", 1.0, "the arm is not stowed")
         return await operator.fly(operator.perch, operator.release)
 
-    result = run_simulated(fly_simulated(load("sim.toml"), lambda _: None, worlds.append, fly=story))
+    result = run_simulated(fly_simulated(CONFIG, lambda _: None, worlds.append, fly=story))
     assert result.failure == ""
     phases = [record.state.phase for record in result.records]
     entered = [after for before, after in pairwise(phases) if before is not after]
@@ -80,4 +84,4 @@ def test_a_servo_that_fails_on_the_bar_is_power_cycled_on_the_ground_and_the_arm
     perched = [r for r in result.records if r.state.phase is Phase.PERCHED]
     held = result.flight.within(perched[-1].t - 1.0, perched[-1].t)
     assert min(sample.truth.contact_force_n for sample in held) > 1.0
-    assert max(max(sample.truth.tension) for sample in result.flight.samples) < load("sim.toml").limits.tension_max_n
+    assert max(max(sample.truth.tension) for sample in result.flight.samples) < CONFIG.limits.tension_max_n
