@@ -3,17 +3,20 @@
 import asyncio
 import math
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
 from arm_companion.clock import run_simulated
 from arm_companion.config import load
 from arm_companion.mission.state import Phase
+from arm_companion.protocol import control_table as ct
 from arm_companion.protocol.control_table import HardwareError
 from arm_companion.protocol.dialect import mav
 from arm_companion.sim.runner import fly_simulated
 from arm_companion.sim.scenario import Operator, ScenarioFailed
 from arm_companion.sim.world import World
+from tests.sim.on_the_ground import OnTheGround
 
 CONFIG = load("sim.toml")
 OUTER = 2
@@ -85,3 +88,32 @@ def test_a_servo_that_fails_on_the_bar_is_power_cycled_on_the_ground_and_the_arm
     held = result.flight.within(perched[-1].t - 1.0, perched[-1].t)
     assert min(sample.truth.contact_force_n for sample in held) > 1.0
     assert max(max(sample.truth.tension) for sample in result.flight.samples) < CONFIG.limits.tension_max_n
+
+
+def test_a_vehicle_that_came_down_on_its_bent_arm_gets_ready_again_without_a_restart(tmp_path: Path) -> None:
+    """A daemon that finds an arm above bent under torque takes the vehicle to hang by it, on the ground too."""
+    rig = OnTheGround(tmp_path, "mount.rpy_deg=[180.0, 0.0, 0.0]", "limits.keep_out.half_angle_deg=0.0")
+    for servo, bent in zip(rig.arm.servos.servos, (1500.0, 0.0, -1500.0, 0.0), strict=True):
+        servo.motor.position += bent
+        servo._hold()
+        servo.poke(ct.TORQUE_ENABLE, 1)
+
+    async def script() -> None:
+        assert rig.state == "HANG_HOLD"
+        assert await rig.order(command=mav.MAV_CMD_ARM_RELEASE) == mav.MAV_RESULT_TEMPORARILY_REJECTED
+        assert "on the ground take the servos' power away, then CLEAR_ERRORS" in rig.text
+        assert await rig.order(command=mav.MAV_CMD_ARM_CLEAR_ERRORS) == mav.MAV_RESULT_TEMPORARILY_REJECTED
+        assert "tendon 1 holds, or may hold: on the ground take the servos' power away" in rig.text
+        assert rig.torque == [1] * 4
+        rig.arm.servos.set_power(on=False)
+        await asyncio.sleep(_OFF_S)
+        assert await rig.order(command=mav.MAV_CMD_ARM_CLEAR_ERRORS) == mav.MAV_RESULT_TEMPORARILY_REJECTED
+        assert "does not answer: see to the power and the cable" in rig.text
+        rig.arm.servos.set_power(on=True)
+        await asyncio.sleep(_BOOTED_S)
+        assert await rig.order(command=mav.MAV_CMD_ARM_CLEAR_ERRORS) == mav.MAV_RESULT_ACCEPTED
+        assert rig.torque == [0] * 4, "nothing moves until told"
+        assert await rig.order(command=mav.MAV_CMD_ARM_READY) == mav.MAV_RESULT_ACCEPTED
+        await rig.until(lambda: rig.state == "READY", 5.0)
+
+    assert rig.run(script).failures == 0
