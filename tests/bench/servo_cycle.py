@@ -36,7 +36,7 @@ def servo_cycle(rounds: int) -> Iterator[Result]:
     ours: list[tuple[float, float]] = []
     theirs: list[tuple[float, float]] = []
     bare: list[float] = []
-    with port() as path:
+    with port(spin=True) as path:
         for _ in range(rounds):
             ours.append(_ours(path))
             theirs.append(_theirs(path))
@@ -59,11 +59,11 @@ def wire_s() -> float:
 
 
 @contextlib.contextmanager
-def port() -> Iterator[Path]:
-    """Where four emulated servos are."""
+def port(*, spin: bool = False) -> Iterator[Path]:
+    """Where four emulated servos are; with `spin` they take a core, and answer when real ones would."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "servos"
-        command = [sys.executable, "-m", "tests.bench.servo_port", str(path)]
+        command = [sys.executable, "-m", "tests.bench.servo_port", str(path), *(["--spin"] if spin else [])]
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as servos:
             if servos.stdout is None or servos.stdout.readline() != b"ready\n":
                 raise RuntimeError("the emulated servos do not start")

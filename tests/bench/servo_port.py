@@ -1,14 +1,31 @@
 """`python -m tests.bench.servo_port PATH`: four emulated servos at a pseudo-terminal, in a process of their own.
 
+With `--spin` it never sleeps, and takes a core for it: servos and wire are hardware, which no scheduler wakes late.
 Whoever started it closes its standard input to end it.
 """
 
 import asyncio
+import selectors
 import sys
+import time
 
 from arm_companion.clock import precise_loop
 from arm_companion.config.schema import ServosConfig
 from arm_companion.sim.servo_emulator import EmulatedBus, ServoEmulator, keep_time
+
+
+class Spinning(selectors.SelectSelector):
+    """A selector that looks again and again instead of waiting."""
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        until = time.perf_counter() + (timeout or 0.0)
+        while not (ready := super().select(0)) and (timeout is None or time.perf_counter() < until):
+            pass
+        return ready
+
+
+def spinning_loop() -> asyncio.SelectorEventLoop:
+    return asyncio.SelectorEventLoop(Spinning())
 
 
 async def serve(path: str) -> None:
@@ -24,5 +41,7 @@ async def serve(path: str) -> None:
 
 
 if __name__ == "__main__":
-    with asyncio.Runner(loop_factory=precise_loop) as runner:
-        runner.run(serve(sys.argv[1]))
+    path, *options = sys.argv[1:]
+    spinning = options == ["--spin"]
+    with asyncio.Runner(loop_factory=spinning_loop if spinning else precise_loop) as runner:
+        runner.run(serve(path))
