@@ -92,11 +92,15 @@ def lift_failed(s: Situation) -> str | None:
 
 
 def nothing_below(s: Situation) -> str | None:
-    """The vehicle has gone down as far as it may, and the load is still on the arm."""
-    reference = s.state.reference
-    if reference is None or not s.external or s.elapsed < _STILL_S or s.state.load.light_s or not lowest(s):
+    """The vehicle has gone down as far as it may, and the load is still on the arm.
+
+    It need not rest there: a load that hangs beside what it lay on, and swings, moves the vehicle about.
+    """
+    reference, load = s.state.reference, s.state.load
+    if reference is None or not s.external or s.elapsed < _STILL_S or load.light_s or math.isnan(load.now):
         return None
-    return None if math.isnan(s.state.load.now) else "nothing found to set the load down on"
+    as_low = abs(reference.position[2] - s.facts.vehicle.position_w[2]) <= _LOWEST_M
+    return "nothing found to set the load down on" if as_low and arrived(reference, s.setting_down) else None
 
 
 def takes_too_long(s: Situation) -> str | None:

@@ -359,6 +359,18 @@ def test_with_nothing_below_the_load_is_kept(parameters: Parameters, hovering: H
     assert not opened(run.said)
 
 
+def test_a_load_that_swings_beside_what_it_lay_on_is_kept(parameters: Parameters, hovering: Hovering) -> None:
+    """It pulls the vehicle to and fro, so that it never rests where it is as low as it may go."""
+    run = Run(carrying(Phase.PLACE, up=0.0), parameters)
+    for i in range(800):
+        facts = moved((0.0, 0.04 * math.sin(0.04 * i), 0.0))(aloft(hovering, MASS, -0.06 * min(i / 400.0, 1.0)))
+        swinging = dataclasses.replace(facts.vehicle, velocity_w=(0.0, 0.16 * math.cos(0.04 * i), 0.0))
+        run.cycle(dataclasses.replace(facts, vehicle=swinging))
+    assert run.phases[:2] == [Phase.PLACE, Phase.CARRY]
+    assert any("nothing found to set the load down on" in text for text in run.texts)
+    assert not opened(run.said)
+
+
 @pytest.mark.parametrize("up", [0.4, 6.0])
 def test_setting_down_has_the_time_that_the_way_down_takes(
     up: float, parameters: Parameters, hovering: Hovering
