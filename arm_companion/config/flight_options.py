@@ -101,7 +101,7 @@ class PerchConfig:
     )
     verify_pull_m: float = option("set-point offset of the pull test", 0.05, unit="m", lower=0.005, upper=0.5)
     verify_give_share: float = option(
-        "share of that offset which a good grip gives at most", 0.3, lower=0.05, upper=0.95
+        "share of that offset which a good grip gives at most, beyond its arm's stretch", 0.3, lower=0.05, upper=0.95
     )
     attempts: int = option(
         "approaches of one PERCH or GRASP that finds nothing, or whose grip does not hold", 2, lower=1, upper=5

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
-from arm_companion.mission.facts import TendonState, Vec3, VehicleState
+from arm_companion.mission.facts import Quaternion, TendonState, Vec3, VehicleState
 from arm_companion.mission.motion import add, norm, rotate, scale, sub
 from arm_companion.mission.payload import DRAG_PER_S
 from arm_companion.values import replace
@@ -73,7 +73,7 @@ class ForceObserver:
             vehicle: newest state, fresh.
             mass: kg, with which it was observed; it cancels out.
         """
-        lean = _lean(vehicle)
+        lean = lean_of(vehicle.attitude_wb)
         if lean is None or self.velocity is None:
             return (0.0, 0.0)
         drag = scale(vehicle.velocity_w, DRAG_PER_S)
@@ -86,7 +86,7 @@ def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: fl
     if old.velocity is None or dt <= 0.0:
         return replace(old, velocity=v)
     since_s = old.since_s + dt
-    lean = _lean(vehicle)
+    lean = lean_of(vehicle.attitude_wb)
     if lean is None:
         return replace(old, velocity=v, since_s=since_s)
     velocity, force = [], []
@@ -97,9 +97,9 @@ def observe_force(old: ForceObserver, vehicle: VehicleState, mass: float, dt: fl
     return replace(old, velocity=(velocity[0], velocity[1]), force=(force[0], force[1]), since_s=since_s)
 
 
-def _lean(vehicle: VehicleState) -> Vec2 | None:
+def lean_of(attitude_wb: Quaternion) -> Vec2 | None:
     """Horizontal acceleration that the tilted thrust makes, m/s^2; None: far from a hover, and nothing can be said."""
-    up = rotate(vehicle.attitude_wb, (0.0, 0.0, -1.0))
+    up = rotate(attitude_wb, (0.0, 0.0, -1.0))
     if up[2] > -0.5:  # more than 60 degrees
         return None
     return (GRAVITY * up[0] / -up[2], GRAVITY * up[1] / -up[2])

@@ -16,6 +16,7 @@ from arm_companion.geometry.se3 import Pose
 from arm_companion.geometry.wrench import rotation_matrix
 from arm_companion.mission import carry
 from arm_companion.mission.facts import StiffnessReport, Vec3, WrenchReport, WrenchSource
+from arm_companion.mission.held_arm import holding_lean
 from arm_companion.mission.hung_wrench import hung_wrench
 from arm_companion.mission.motion import ZERO, add, scale, sub, unrotate
 from arm_companion.mission.sharing import SHARING, SUSPENDED
@@ -327,31 +328,13 @@ def _lean(s: Situation, solution: ArmSolution | None) -> Vec3:
     """Acceleration that holds the vehicle at its reference against the anchored arm, m/s^2, world axes.
 
     From the force at the *reference*: a force measured where the vehicle is would cancel the arm's own
-    stiffness, which is positive feedback. A multirotor leans to accelerate, and leaning swings the arm's base,
-    so both act: with the arm's stiffness S at its base, the wanted move x of the centre of mass, base offset r
-    and the tilt `phi = (-z) x a / g` that the acceleration a takes,
-
-        m a + S_f (x + phi x r, phi) = 0.
+    stiffness, which is positive feedback.
     """
     reference, anchor = s.state.reference, s.state.anchor
-    if s.state.phase is not Phase.PERCHED or reference is None or anchor is None or solution is None:
+    if s.state.phase is not Phase.PERCHED or reference is None or anchor is None:
         return ZERO
-    move = np.asarray(sub(reference.position, s.rest))
-    if not move.any():
-        return ZERO
-    try:
-        S = solution.base_stiffness[:3]
-    except ModelError:
-        return ZERO
-    R_wb = so3.from_quaternion(s.facts.vehicle.attitude_wb)
-    R_wa = R_wb @ s.mount.rotation
-    S_move, S_turn = (R_wa @ S[:, half] @ R_wa.T for half in (slice(0, 3), slice(3, 6)))
-    tilt = so3.hat((0.0, 0.0, -1.0)) / GRAVITY
-    swing = -so3.hat(R_wb @ s.mount.position) @ tilt
-    A = s.config.vehicle.mass_kg * np.eye(3) + S_move @ swing + S_turn @ tilt
-    north, east, _ = -np.linalg.solve(A, S_move @ move)
-    # up and down the autopilot's own loop is stiff and integrates, and a wrap pushed hard there slides
-    return float(north), float(east), 0.0
+    move = sub(reference.position, s.rest)
+    return holding_lean(s, solution, move) if any(move) else ZERO
 
 
 def _stiffness(s: Situation, solution: ArmSolution | None) -> StiffnessReport | None:
