@@ -28,6 +28,12 @@ pytestmark = pytest.mark.realtime
 READY, STOW, PERCH, RELEASE = 64000, 64001, 64002, 64004
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, FAILED, IN_PROGRESS = 0, 1, 2, 4, 5
 ARM, AUTOPILOT = (1, 192), (1, 1)
+# what a shell starts in the background inherits that Ctrl-C is ignored
+_INTERRUPTIBLE = """
+import os, signal, sys
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+os.execv(sys.argv[1], sys.argv[1:])
+"""
 
 
 def free_port() -> int:
@@ -288,7 +294,9 @@ def running(words: list[str]) -> list[str]:
 def test_ctrl_c_ends_a_flight_in_order_however_often_it_is_pressed(tmp_path: Path, presses: int) -> None:
     words = [sys.executable, "-m", "arm_companion", "sim", "perch", "--output", str(tmp_path)]
     words += on_ports_of_its_own(tmp_path)
-    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as flight:
+    with subprocess.Popen(
+        [sys.executable, "-c", _INTERRUPTIBLE, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as flight:
         assert flight.stdout is not None
         while "READY" not in flight.stdout.readline():
             assert flight.poll() is None

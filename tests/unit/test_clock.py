@@ -2,7 +2,7 @@
 
 import asyncio
 import signal
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterator
 from typing import Any
 
 import pytest
@@ -11,6 +11,14 @@ from arm_companion.clock import Clock, run_real_time, run_simulated, ticks
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
 both = pytest.mark.parametrize("run", [run_real_time, run_simulated])
+
+
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Ctrl-C as in a terminal: what a shell starts in the background inherits that it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 def test_an_hour_of_waiting_takes_no_time_and_ends_at_the_hour() -> None:
@@ -86,6 +94,7 @@ def test_unix_stamps_do_not_follow_a_step_of_the_wall_clock() -> None:
 
 
 @both
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_cancels_and_pressed_again_does_not_cut_the_orderly_end_short(run: Run) -> None:
     ended = []
 
@@ -99,11 +108,10 @@ def test_ctrl_c_cancels_and_pressed_again_does_not_cut_the_orderly_end_short(run
                 await asyncio.sleep(0.01)
             ended.append("in order")
 
-    handler = signal.getsignal(signal.SIGINT)
     with pytest.raises(KeyboardInterrupt):
         run(main())
     assert ended == ["in order"]
-    assert signal.getsignal(signal.SIGINT) is handler is signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 @both
