@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from arm_companion.mission import calibrating, carry, gripper, pressing, reaching
-from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
+from arm_companion.mission import beside, calibrating, carry, gripper, pressing, reaching
 from arm_companion.mission.facts import ArmAction, Setpoint, Vec3
 from arm_companion.mission.hazards import astray
 from arm_companion.mission.motion import (
@@ -64,7 +63,6 @@ _GENTLY = 0.2
 _YAW_RATE = 0.6
 _FAR_FACTOR = 3.0
 _STILL_FAR_M = 0.5
-_FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 _REST_S = 5.0
 _AT_REST_M = 0.002
 _TIGHT_SHARE = 0.8  # of the tension limit, at which a wrap is tight enough; reading and servo overshoot have the rest
@@ -115,7 +113,7 @@ def _prepare(s: Situation) -> State:
             force = replace(state.force, tared_s=0.0, since_s=0.0, above_s=0.0)
             return replace(state, force=force, contact_w=s.place(0.0))
         case Phase.CONTACT:
-            return replace(state, contact_w=_touching(s))
+            return replace(state, contact_w=beside.touching(s))
         case Phase.WRAP | Phase.CLOSE:
             x, y = s.towards_bar_a
             theta = s.config.perch.wrap_bend_rad
@@ -286,10 +284,10 @@ def _reference(s: Situation) -> Reference | None:
     if state.phase in SHARING:
         return hung_reference(s, reference)
     if state.phase in _WITH_CURL:
-        beside = _beside_bar(s)
-        if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(beside)):
+        place = beside.curling(s)
+        if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(place)):
             return reference.still  # nobody knows where the bar was met
-        return Reference(pressing.not_back_down(s, beside, reference.position), ZERO, state.heading)
+        return Reference(pressing.not_back_down(s, place, reference.position), ZERO, state.heading)
     goal, speed = _goal(s)
     # an arm that is wrapped is not turned in by a heading of another place: after a restart nobody knows the bar's
     keeps = state.phase is Phase.UNLOAD and state.anchor is None
@@ -302,45 +300,6 @@ def _reference(s: Situation) -> Reference | None:
         yaw_rate=_YAW_RATE,
         dt=s.dt,
     )
-
-
-def _touching(s: Situation) -> Vec3:
-    """Vehicle position, height aside, at which the straight arm just touches the bar that was found, world axes.
-
-    The vehicle is past it by what bends the arm, a cantilever up to the bar, and by what it flew while the
-    force observer followed.
-    """
-    arm, perch = s.parameters.model.parameters, s.config.perch
-    cantilever = 3.0 * arm.EI / perch.contact_arc_m**3
-    force = strength(s.state.force.residual)
-    past = min(force / cantilever + OBSERVER_LAG_S * perch.reach_speed_m_per_s, perch.overreach_m)
-    x, y, _ = add(s.facts.vehicle.position_w, scale(s.ahead, -past))
-    return x, y, s.place(0.0)[2]
-
-
-def _beside_bar(s: Situation) -> Vec3:
-    """Vehicle position that suits the present bend, between the bar just cleared and the full wrap, world axes.
-
-    Tendons bend the whole arm alike, so an arm that wraps a bar curls from its base on: while it bends, the
-    vehicle comes down along the arm by the length that the bar was away, and forward by the clearance. On this
-    way the arm meets the bar only when the wrap closes, which keeps the vehicle from bouncing off it.
-    """
-    state, perch = s.state, s.config.perch
-    if s.gripping:  # the straight arm has nothing to curl around
-        return s.contact_w
-    share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
-    closed = add(s.contact_w, scale(s.straight_w, perch.contact_arc_m))
-    if state.phase is Phase.RELEASE and state.anchor is not None:
-        closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
-    # forward first, while the curl is still wide; and away from the bar before anything can hook into it
-    leaves = state.phase is Phase.RELEASE and not s.grasping and state.kind is PerchKind.ANCHOR
-    forward = 1.0 if leaves else _FORWARD_SHARE
-    ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / forward, 0.0))
-    return add(add(s.contact_w, scale(sub(closed, s.contact_w), share)), ahead)
-
-
-def _clear_of_bar(s: Situation) -> Vec3:
-    return add(s.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
 
 
 def _goal(s: Situation) -> tuple[Vec3, float]:
@@ -357,7 +316,7 @@ def _goal(s: Situation) -> tuple[Vec3, float]:
         case Phase.DEPART:
             return s.standoff, s.speed_back
         case Phase.CONTACT:
-            return _clear_of_bar(s), perch.reach_speed_m_per_s
+            return beside.clear(s), perch.reach_speed_m_per_s
         case Phase.REACH:
             hurry = 1.0 if s.near_bar else _FAR_FACTOR
             return s.place(-perch.overreach_m), hurry * perch.reach_speed_m_per_s

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from arm_companion.arm.reaction import GRAVITY
+from arm_companion.mission.beside import touching
 from arm_companion.mission.facts import ArmFault, Commands, Control, Facts, GraspTarget, Order, Result, WrenchSource
 from arm_companion.mission.motion import Reference, norm
 from arm_companion.mission.parameters import Parameters
@@ -139,6 +140,22 @@ def test_the_object_is_the_one_told_last_and_else_the_configured_one(
     assert (bar.point_w, bar.radius) == ((4.0, 1.0, -1.0), 0.02)
     assert bar.axis_w == pytest.approx((math.cos(0.5), math.sin(0.5), 0.0))
     assert Situation(memory(Phase.REACH), told, T0, parameters).bar.point_w == parameters.config.perch.bar_position_m
+
+
+@pytest.mark.parametrize(("task", "beside_m"), [(Order.GRASP, 0.0), (Order.PERCH, 0.03)])
+def test_an_object_is_taken_by_its_middle_and_a_bar_where_it_was_met(
+    parameters: Parameters, hovering: Hovering, task: Order, beside_m: float
+) -> None:
+    """In wind it is met beside its middle; held there, its weight leans the vehicle as it comes off."""
+    ahead, aside = np.array((math.cos(0.3), math.sin(0.3), 0.0)), np.array((-math.sin(0.3), math.cos(0.3), 0.0))
+    state = memory(Phase.CONTACT, task=task, heading=0.3)
+    planned = np.array(Situation(state, hovering(), T0, parameters).place(0.0))
+    for past in (0.0, 0.01):
+        here = vehicle(position_w=tuple((planned + past * ahead + 0.03 * aside).tolist()))(hovering())
+        met = np.array(touching(Situation(state, here, T0, parameters))) - planned
+        assert met @ aside == pytest.approx(beside_m)
+        assert -0.02 < met @ ahead - past < 0.0, "less what the observer was late by"
+        assert met[2] == pytest.approx(0.0)
 
 
 # --- taking ---

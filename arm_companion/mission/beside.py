@@ -1,0 +1,55 @@
+"""Where the vehicle goes beside a bar or object that the arm has met, while it has not yet gripped it or lets it go."""
+
+import math
+
+from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
+from arm_companion.mission.facts import Vec3
+from arm_companion.mission.motion import add, dot, scale, sub
+from arm_companion.mission.situation import Situation
+from arm_companion.mission.state import PerchKind, Phase
+
+_FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
+
+
+def touching(s: Situation) -> Vec3:
+    """Vehicle position, height aside, at which the straight arm just touches the bar that was found, world axes.
+
+    The vehicle is past it by what bends the arm, a cantilever up to the bar, and by what it flew while the
+    force observer followed. A bar is taken where the vehicle met it, an object at its middle: held beside that, its
+    weight turns the vehicle as it comes off.
+    """
+    arm, perch = s.parameters.model.parameters, s.config.perch
+    cantilever = 3.0 * arm.EI / perch.contact_arc_m**3
+    force = strength(s.state.force.residual)
+    past = min(force / cantilever + OBSERVER_LAG_S * perch.reach_speed_m_per_s, perch.overreach_m)
+    planned, met = s.place(0.0), s.facts.vehicle.position_w
+    if s.grasping:
+        met = add(planned, scale(s.ahead, dot(sub(met, planned), s.ahead)))
+    x, y, _ = add(met, scale(s.ahead, -past))
+    return x, y, planned[2]
+
+
+def curling(s: Situation) -> Vec3:
+    """Vehicle position that suits the present bend, between the bar just cleared and the full wrap, world axes.
+
+    Tendons bend the whole arm alike, so an arm that wraps a bar curls from its base on: while it bends, the
+    vehicle comes down along the arm by the length that the bar was away, and forward by the clearance. On this
+    way the arm meets the bar only when the wrap closes, which keeps the vehicle from bouncing off it.
+    """
+    state, perch = s.state, s.config.perch
+    if s.gripping:  # the straight arm has nothing to curl around
+        return s.contact_w
+    share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
+    closed = add(s.contact_w, scale(s.straight_w, perch.contact_arc_m))
+    if state.phase is Phase.RELEASE and state.anchor is not None:
+        closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
+    # forward first, while the curl is still wide; and away from the bar before anything can hook into it
+    leaves = state.phase is Phase.RELEASE and not s.grasping and state.kind is PerchKind.ANCHOR
+    forward = 1.0 if leaves else _FORWARD_SHARE
+    ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / forward, 0.0))
+    return add(add(s.contact_w, scale(sub(closed, s.contact_w), share)), ahead)
+
+
+def clear(s: Situation) -> Vec3:
+    """Vehicle position from which the straight arm leaves room for a curl, world axes, m."""
+    return add(s.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
