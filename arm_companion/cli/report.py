@@ -30,21 +30,22 @@ def run(arguments: argparse.Namespace) -> int:
     if importlib.util.find_spec("matplotlib") is None:
         print("arm-companion report needs 'matplotlib': pip install 'arm-companion[report]'", file=sys.stderr)
         return 2
-    from arm_companion.record.reader import Reader, truth_beside  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.record.reader import Reader  # noqa: PLC0415 - after the check for the extra
     from arm_companion.report.figures import pictures  # noqa: PLC0415
     from arm_companion.report.flight import read  # noqa: PLC0415
     from arm_companion.report.page import page  # noqa: PLC0415
     from arm_companion.report.words import judge  # noqa: PLC0415
 
     log: Path = arguments.log
-    record, truth, beside = Reader(log), None, truth_beside(log)
-    if arguments.truth:
-        truth = Reader(arguments.truth)
-    elif beside.is_file():
+    record = Reader(log)
+    truth, beside = None, arguments.truth or _truth_of(log)
+    if beside is not None:
         try:
             truth = Reader(beside)
-        except RecordError as error:  # the simulator was stopped as it wrote it; the flight is worth a page
-            record.remarks.append(str(error))
+        except RecordError as error:
+            if arguments.truth:
+                raise
+            record.remarks.append(str(error))  # the simulator was stopped as it wrote it; the flight is worth a page
     flight = read(record, truth)
     verdict = judge(flight)
     output: Path = arguments.output or _beside(log)
@@ -71,6 +72,14 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"  {point}")
         print(file)
     return 0
+
+
+def _truth_of(log: Path) -> Path | None:
+    """The simulator's truth of a record or of one of its parts, which have one together; None: there is none."""
+    from arm_companion.record.reader import truth_beside  # noqa: PLC0415 - after the check for the extra
+    from arm_companion.record.storage import first_of  # noqa: PLC0415
+
+    return next((file for file in map(truth_beside, (log, first_of(log)[0])) if file.is_file()), None)
 
 
 def _beside(log: Path) -> Path:

@@ -15,13 +15,19 @@ def part(first: Path, number: int) -> Path:
     return first if number == 1 else first.with_name(f"{first.stem}-{number:03d}{first.suffix}")
 
 
-def following(path: Path) -> Path:
-    """The part after this one, as far as its name tells."""
+def first_of(path: Path) -> tuple[Path, int]:
+    """The first part of a part's record and the part's own number, as far as its name tells."""
     match = re.fullmatch(r"(.+)-(\d{3,})", path.stem)
     # 20260101-120000 is a start, not part 120000
     if match is None or (_OURS.fullmatch(path.name) and match[2] == path.stem[9:]):
-        return part(path, 2)
-    return path.with_name(f"{match[1]}-{int(match[2]) + 1:03d}{path.suffix}")
+        return path, 1
+    return path.with_name(f"{match[1]}{path.suffix}"), int(match[2])
+
+
+def following(path: Path) -> Path:
+    """The part after this one, as far as its name tells."""
+    first, number = first_of(path)
+    return part(first, number + 1)
 
 
 def oldest_left(first: Path) -> Path | None:

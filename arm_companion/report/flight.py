@@ -279,8 +279,10 @@ def _truth(reader: Reader, flight: RecordedFlight) -> dict[str, Array]:
     items = list(itertools.islice(reader.messages((TRUTH,)), 0, None, 5))
     flight.remarks += reader.remarks
     t = np.array([(item.unix_ns - flight.began_ns) * 1e-9 for item in items])
-    if not len(t) or t[-1] < 0.0 or t[0] > flight.seconds:
+    of_this = np.flatnonzero((t >= 0.0) & (t <= flight.seconds))  # a part of a record has a part of its truth
+    if not len(of_this):
         flight.remarks.append(f"{reader.path.name} has no truth of this flight")
         return {}
-    rows = [orjson.loads(item.data) for item in items]
-    return {name: np.array([row[name] for row in rows], dtype=float) for name in rows[0] if name != "t"} | {"t": t}
+    rows = [orjson.loads(items[i].data) for i in of_this]
+    found = {name: np.array([row[name] for row in rows], dtype=float) for name in rows[0] if name != "t"}
+    return found | {"t": t[of_this]}

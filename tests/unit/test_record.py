@@ -350,6 +350,9 @@ def test_parts_are_read_in_their_order(tmp_path: Path) -> None:
 )
 def test_names_of_parts(name: str, after: str) -> None:
     assert storage.following(Path(name)) == Path(after)
+    first, number = storage.first_of(Path(after))
+    assert storage.part(first, number) == Path(after)
+    assert storage.part(first, number - 1) == Path(name)
 
 
 class Held(McapFile):

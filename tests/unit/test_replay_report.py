@@ -464,6 +464,25 @@ def test_a_truth_that_does_not_belong_is_left_out(tmp_path: Path, capsys: pytest
         assert "against the simulator's truth" not in said
 
 
+def test_a_later_part_has_its_part_of_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The simulator writes one file for all parts, and calls it after the first."""
+    part, whole = tmp_path / "r-002.mcap", truth_beside(tmp_path / "r.mcap")
+    copy(part, upto=200)
+    flight = read(Reader(part))
+    file = McapFile(whole, {"format": FORMAT, "content": "truth"})
+    for i in range(2000):
+        values = {"position_w": [0.0] * 3, "force_b": [0.0] * 3, "torque_b": [0.0] * 3, "tension": [4.0] * 4}
+        at = flight.began_ns + i * 10**8
+        file.json(TRUTH, at, {"t": 0.1 * i, **values, "contact_force_n": 0.0, "wrap_angle": 0.0})
+    file.close()
+    t = read(Reader(part), Reader(whole)).truth["t"]
+    assert 0.0 <= t[0] < 0.5
+    assert flight.seconds - 0.5 < t[-1] <= flight.seconds
+    assert main(["report", str(part)]) == 0
+    assert "no truth" not in capsys.readouterr().out
+    assert "thin: the simulator" in (tmp_path / "r-002" / "report.html").read_text(encoding="utf-8")
+
+
 def test_an_earlier_runs_truth_is_gone_before_the_next(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sim, "_fly", lambda *_: 0)
     (tmp_path / "record.truth.mcap").write_bytes(b"of an earlier run")
