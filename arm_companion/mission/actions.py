@@ -53,7 +53,7 @@ _ORDER_OF_LEAVING = (Phase.TAKE_BACK, *_ORDER_OF_RELEASE)
 _ORDER_OF_SETTING_DOWN = (Phase.PLACE, Phase.RELEASE, Phase.DEPART, Phase.STOWING, Phase.STOWED)
 _CURLS = (Phase.WRAP, Phase.CLOSE)
 _WITH_CURL = (*_CURLS, Phase.RELEASE)
-_FLIES = frozenset({Phase.APPROACH, Phase.REACH, Phase.CONTACT, Phase.DEPART})
+_FLIES = frozenset({Phase.APPROACH, Phase.REACH, Phase.CONTACT, Phase.LIFT, Phase.DEPART})
 """Phases in which nothing holds the vehicle: a change of speed that it is not told of it makes late, and overshoots."""
 
 _WITH_LOAD = CARRYING | frozenset({Phase.VERIFY})

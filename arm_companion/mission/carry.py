@@ -38,7 +38,9 @@ _STEADY_S = 2.5  # until a vehicle that the closing arm has pulled about rests a
 _FOLLOW_S = 0.5
 _TOUCHING_SHARE = 0.7
 _ALONE_SHARE = 0.9  # of the load: with less, something else carries the rest
-_TEST_SHARE = 0.2  # of the lifting speed: the load comes on within millimetres, and the push has to keep up with it
+_TEST_SHARE = 0.2  # of the lifting speed: where the load comes on by the lift alone, it does so within millimetres
+_COMES_ON_S = 4.0  # in which the push of a test lift would grow to the heaviest object
+_ROSE_M = 0.006  # beyond what an estimate wanders by meanwhile
 _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
 _GRIP_S = 1.0
@@ -130,7 +132,7 @@ def goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes with a load, and how fast."""
     grasp = s.config.grasp
     if s.state.phase is Phase.VERIFY:
-        if s.elapsed < _steady_s(s):
+        if s.elapsed < _steady_s(s) or _comes_on(s):
             return s.rest, grasp.lift_speed_m_per_s
         return add(s.rest, s.state.offset), (1.0 if s.gripping else _TEST_SHARE) * grasp.lift_speed_m_per_s
     if s.state.phase is Phase.LIFT:
@@ -195,7 +197,23 @@ def _steady_s(s: Situation) -> float:
 
 
 def _pluck(s: Situation) -> float:
-    return gripper.pluck(s) if s.gripping and s.state.phase is Phase.VERIFY else 0.0
+    """Load, kg, that the push of a test lift is for whatever is felt so far, until the vehicle rises."""
+    if s.state.phase is not Phase.VERIFY:
+        return 0.0
+    if s.gripping:
+        return gripper.pluck(s)
+    return s.config.grasp.mass_max_kg * (s.elapsed - _STEADY_S) / _COMES_ON_S if _comes_on(s) else 0.0
+
+
+def _comes_on(s: Situation) -> bool:
+    """Whether a wrapped arm takes its load by the push alone: an object that still lies holds the vehicle down.
+
+    Asked up meanwhile it would come away from where it is asked to be, and the flight stack's integrator wind up.
+    """
+    if s.gripping or not s.state.feedforward or math.isnan(s.state.load.now):
+        return False
+    since = s.elapsed - _STEADY_S
+    return 0.0 <= since < _COMES_ON_S and s.probe[2] - s.state.position[2] <= _ROSE_M
 
 
 def payload(s: Situation) -> Payload | None:

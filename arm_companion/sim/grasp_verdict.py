@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from arm_companion.config.schema import Config
 from arm_companion.sim.flight import CARRIED, WITH, WITHOUT, Flight
+from arm_companion.sim.flight_control import GRAVITY
 from arm_companion.sim.verdict import Verdict, after, excursion, unharmed, wrench_errors
 from arm_companion.sim.world import Sample
 
@@ -17,6 +18,7 @@ _HELD_SHARE = 0.95
 _LIFTED_SHARE = 0.7
 _STILL_M = 0.003
 _ASKED_UP_M = 0.002
+_LOADED_SHARE = 1.0 / 3.0  # of the object's weight
 _CLEAR_S = 1.0
 _FELL_M_PER_S = 0.5  # it is set down at a fifth of that
 _SETTLED_S = 2.0
@@ -25,14 +27,16 @@ _PICK_UP = ("VERIFY", "LIFT")
 
 @dataclass(frozen=True)
 class PickUp:
-    """How well the vehicle kept to what it was asked while the load came on, from the first step up to the carrying.
+    """How well the vehicle kept to what it was asked while the load came on, up to the carrying.
+
+    From when it is asked up or a third of the load is on the arm, whichever comes first.
 
     Attributes:
         name: with or without feed-forward.
         error_m: distance from the height asked, RMS: the load pulls down, and the feed-forward pushes up.
         worst_m: greatest distance below it.
         aside_m: distance from the place asked, RMS: what swings when the object comes free, which nothing compensates.
-        seconds: from the first step up to the carried object.
+        seconds: of this.
     """
 
     name: str
@@ -87,7 +91,7 @@ def judge_grasp(flight: Flight, failure: str, config: Config) -> GraspVerdict:
     kinds = {"free": ("READY", "APPROACH", "DEPART"), "carried": ("LIFT", "CARRY", "PLACE")}
     verdict.wrench = wrench_errors(flight, kinds)
     verdict.excursion_m = excursion(flight)
-    verdict.pick_ups = _pick_ups(flight)
+    verdict.pick_ups = _pick_ups(flight, config.sim.object.mass_kg)
     verdict.mass_kg, verdict.placed_m = config.sim.object.mass_kg, placed
     weights = [seen for seen in flight.payloads if seen.valid]
     if weights:
@@ -136,7 +140,8 @@ def _left_alone(flight: Flight) -> list[str]:
     return reasons
 
 
-def _pick_ups(flight: Flight) -> list[PickUp]:
+def _pick_ups(flight: Flight, mass: float) -> list[PickUp]:
+    """Both of them, of an object of so many kg."""
     found = []
     spans = flight.spans()
     for mark in flight.marks:
@@ -146,7 +151,12 @@ def _pick_ups(flight: Flight) -> list[PickUp]:
         start, end = inside[0][0], inside[-1][1]
         during = flight.within(start, end + _SETTLED_S)
         asked = [(s, place) for s in during if (place := flight.asked_at(s.t)) is not None]
-        samples = [(s, place) for s, place in asked if asked[0][1][2] - place[2] > _ASKED_UP_M]
+        if not asked:
+            continue
+        loaded = min(s.truth.force_b[2] for s, _ in asked) + _LOADED_SHARE * mass * GRAVITY
+        top = asked[0][1][2] - _ASKED_UP_M
+        begins = (i for i, (s, place) in enumerate(asked) if place[2] < top or s.truth.force_b[2] > loaded)
+        samples = asked[next(begins, len(asked)) :]
         if not samples:
             continue
         below = [s.state.position_w[2] - place[2] for s, place in samples]

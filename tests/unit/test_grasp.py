@@ -10,7 +10,17 @@ import pytest
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.beside import touching
-from arm_companion.mission.facts import ArmFault, Commands, Control, Facts, GraspTarget, Order, Result, WrenchSource
+from arm_companion.mission.facts import (
+    ArmFault,
+    Commands,
+    Control,
+    Facts,
+    GraspTarget,
+    Order,
+    Result,
+    Vec3,
+    WrenchSource,
+)
 from arm_companion.mission.motion import Reference, norm
 from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Flow, Load, ThrustCurve
@@ -161,6 +171,13 @@ def test_an_object_is_taken_by_its_middle_and_a_bar_where_it_was_met(
 # --- taking ---
 
 
+def asked(run: Run) -> tuple[Vec3, Vec3]:
+    """Place and acceleration of the newest set-point."""
+    said = run.said[-1].setpoint
+    assert said is not None
+    return said.position_w, said.acceleration_w
+
+
 def test_an_arm_that_closes_around_nothing_goes_back(parameters: Parameters, hovering: Hovering) -> None:
     wrap = parameters.config.perch.wrap_bend_rad
     run = Run(memory(Phase.CLOSE, since=T0 - 10.0, bend=(wrap, 0.0), bend_goal=(wrap, 0.0)), parameters)
@@ -172,15 +189,39 @@ def test_an_arm_that_closes_around_nothing_goes_back(parameters: Parameters, hov
 def test_the_test_lift_waits_until_the_vehicle_is_steady_then_goes_up(
     parameters: Parameters, hovering: Hovering
 ) -> None:
-    run = Run(hovered(Phase.CLOSE, tension=(30.0, 5.0, 1.0, 5.0), bend=BENT, bend_goal=BENT), parameters)
+    closed = {"tension": (30.0, 5.0, 1.0, 5.0), "bend": BENT, "bend_goal": BENT, "feedforward": False}
+    run = Run(hovered(Phase.CLOSE, **closed), parameters)
     run.cycle(hovering(BENT))
     assert run.state.phase is Phase.VERIFY
     run.cycles(hovering(BENT), 2.0)
-    assert run.said[-1].setpoint is not None
-    assert run.said[-1].setpoint.position_w == PLACE
+    assert asked(run)[0] == PLACE
     run.cycles(hovering(BENT), 2.0)
-    assert run.said[-1].setpoint is not None
-    assert run.said[-1].setpoint.position_w[2] < PLACE[2] - 0.01
+    assert asked(run)[0][2] < PLACE[2] - 0.01
+
+
+@pytest.mark.parametrize("rises", [True, False])
+def test_an_object_that_lies_is_taken_by_the_push_before_the_vehicle_is_asked_up(
+    parameters: Parameters, hovering: Hovering, rises: bool
+) -> None:
+    """It holds the vehicle down: asked up meanwhile, it would be centimetres away from where it is asked to be."""
+    lift = {"task": Order.GRASP, "since": T0 - 2.4, "offset": (0.0, 0.0, -0.05)}
+    run = Run(carrying(Phase.VERIFY, up=0.0, now=0.0, **lift), parameters)
+    pushes = []
+    for tenth in range(20):
+        run.cycles(aloft(hovering, 0.01 * tenth, 0.0), 0.1)
+        place, push = asked(run)
+        assert place[2] == pytest.approx(PLACE[2]), "not asked up"
+        pushes.append(-push[2] * 1.8 * 1.25 / GRAVITY)
+    assert pushes[-1] == pytest.approx(0.24, abs=0.02), "kg: an eighth a second"
+    assert all(0.0 <= more - less < 0.02 for less, more in itertools.pairwise(pushes)), "without a jump"
+    if rises:
+        run.cycles(aloft(hovering, MASS, 0.01), 1.0)
+        place, push = asked(run)
+        assert -0.025 < place[2] - PLACE[2] < -0.01, "asked up from when it rose"
+        assert -push[2] * 1.8 * 1.25 / GRAVITY == pytest.approx(MASS, rel=0.1), "what is felt, and no more"
+    else:
+        run.cycles(aloft(hovering, MASS, 0.0), 3.0)
+        assert asked(run)[0][2] < PLACE[2] - 0.01, "a push that is as great as it may be has to be helped"
 
 
 @pytest.mark.parametrize(
