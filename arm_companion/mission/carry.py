@@ -41,6 +41,7 @@ _ALONE_SHARE = 0.9  # of the load: with less, something else carries the rest
 _TEST_SHARE = 0.2  # of the lifting speed: where the load comes on by the lift alone, it does so within millimetres
 _COMES_ON_S = 4.0  # in which the push of a test lift would grow to the heaviest object
 _ROSE_M = 0.006  # beyond what an estimate wanders by meanwhile
+_CATCH_UP = 4.0  # 1/s
 _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
 _GRIP_S = 1.0
@@ -50,8 +51,12 @@ _GRIP_SIGMA = (0.015, 0.03, 0.015)  # m, base axes: along the bend, along the ob
 def track_load(s: Situation) -> Load:
     """The load after this cycle; a mean begins anew with every lift."""
     load = _lifted(s)
+    if not s.external:
+        load = replace(load, before=0.0)  # a flight stack that is flown by somebody else begins anew
     if s.state.phase is not Phase.VERIFY or not s.grasping:
         return replace(load, found=None, found_s=0.0)
+    if s.elapsed < _steady_s(s) and not math.isnan(load.now):
+        load = replace(load, before=max(load.now, 0.0))
     found = _found(s, load.now)
     return replace(load, found=found, found_s=load.found_s + s.dt if found is load.found else 0.0)
 
@@ -132,9 +137,12 @@ def goal(s: Situation) -> tuple[Vec3, float]:
     """Where the reference goes with a load, and how fast."""
     grasp = s.config.grasp
     if s.state.phase is Phase.VERIFY:
-        if s.elapsed < _steady_s(s) or _comes_on(s):
+        x, y, z = s.rest
+        if s.elapsed < _steady_s(s):
             return s.rest, grasp.lift_speed_m_per_s
-        return add(s.rest, s.state.offset), (1.0 if s.gripping else _TEST_SHARE) * grasp.lift_speed_m_per_s
+        if _comes_on(s):
+            return (x, y, min(z, s.state.position[2])), grasp.lift_speed_m_per_s
+        return add(s.rest, s.state.offset), _test_speed(s)
     if s.state.phase is Phase.LIFT:
         return add(s.probe, (0.0, 0.0, -grasp.lift_height_m)), grasp.lift_speed_m_per_s
     if s.state.feedforward and s.state.reference is not None and _touching_down(s):
@@ -146,6 +154,15 @@ def goal(s: Situation) -> tuple[Vec3, float]:
         )
     share = _SLOWLY if s.probe[2] - here[2] < _NEAR_GROUND_M else 1.0
     return down, share * grasp.lift_speed_m_per_s
+
+
+def _test_speed(s: Situation) -> float:
+    """Of the reference in a test lift, m/s: slow, but not left behind by an object that breaks free."""
+    fast = s.config.grasp.lift_speed_m_per_s
+    if s.gripping or s.state.reference is None:
+        return fast
+    above = max(s.state.reference.position[2] - s.state.position[2], 0.0)
+    return min(_TEST_SHARE * fast + _CATCH_UP * above, fast)
 
 
 def _way_down(s: Situation) -> float:
@@ -188,7 +205,8 @@ def push(s: Situation) -> Vec3:
     # ArduPilot follows the acceleration that it measures, and so makes what is asked on any curve
     curve = None if s.config.vehicle.autopilot == "ardupilot" else load.curve
     gain = 1.0 if curve is None else curve.gain
-    return (0.0, 0.0, -mass * GRAVITY / s.config.vehicle.mass_kg / gain)
+    pushed = max(mass - load.before, 0.0)  # the rest its integrator has taken on by itself, and keeps
+    return (0.0, 0.0, -pushed * GRAVITY / s.config.vehicle.mass_kg / gain)
 
 
 def _steady_s(s: Situation) -> float:

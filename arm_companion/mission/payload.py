@@ -201,6 +201,7 @@ class Load:
         found: what the test lift finds at this moment; None: it cannot be told, or there is no test lift.
         found_s: how long it has found just that.
         grounded: the vehicle has been seen to stand, and has not climbed since.
+        before: what the flight stack's own loops lifted of it before a push began, kg.
     """
 
     curve: ThrustCurve | None = None
@@ -215,6 +216,7 @@ class Load:
     found: Found | None = None
     found_s: float = 0.0
     grounded: bool = False
+    before: float = 0.0
 
     @property
     def known(self) -> bool:
