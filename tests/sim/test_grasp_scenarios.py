@@ -60,7 +60,7 @@ def test_an_object_is_picked_up_weighed_carried_and_put_back_twice() -> None:
     assert abs(verdict.weighed_kg - verdict.mass_kg) < 3.0 * verdict.weighed_sigma_kg
     without, compensated = verdict.pick_ups
     assert compensated.seconds < without.seconds
-    assert compensated.error_m < 0.35 * without.error_m
+    assert compensated.error_m < 0.3 * without.error_m
     wrench = {error.span: error for error in verdict.wrench}["carried"]
     assert wrench.force_error_n < 0.2 * wrench.true_force_n
     assert max(max(s.truth.tension) for s in result.flight.samples) < CONFIG.limits.tension_max_n
