@@ -40,7 +40,7 @@ _TOUCHING_SHARE = 0.7
 _ALONE_SHARE = 0.9  # of the load: with less, something else carries the rest
 _TEST_SHARE = 0.2  # of the lifting speed: where the load comes on by the lift alone, it does so within millimetres
 _COMES_ON_S = 4.0  # in which the push of a test lift would grow to the heaviest object
-_ROSE_M = 0.006  # beyond what an estimate wanders by meanwhile
+_ROSE_M = 0.008  # beyond what an estimate wanders by meanwhile
 _CATCH_UP = 4.0  # 1/s
 _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
@@ -125,9 +125,15 @@ def prepare(s: Situation) -> State:
 
 
 def settle(s: Situation) -> State:
-    """Memory while a closed arm comes to rest on its object: the set-point follows the vehicle, so nothing winds up."""
-    state = s.state
-    if state.phase is not Phase.VERIFY or s.elapsed >= _steady_s(s) or state.anchor is None or not s.vehicle_fresh:
+    """Memory while a closed arm rests on its object: the set-point follows the vehicle, so nothing winds up.
+
+    Up to a push that lifts no object yet: PX4's height wanders by a centimetre within half a second.
+    """
+    state, grasp = s.state, s.config.grasp
+    lies_s = _steady_s(s)
+    if _comes_on(s):
+        lies_s += _COMES_ON_S * grasp.mass_min_kg / grasp.mass_max_kg
+    if state.phase is not Phase.VERIFY or s.elapsed >= lies_s or state.anchor is None or not s.vehicle_fresh:
         return state
     rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
     return replace(state, rest=rest, anchor=replace(state.anchor, position_w=rest))
