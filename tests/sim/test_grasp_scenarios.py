@@ -1,5 +1,6 @@
 """Whole flights with an object, in simulated time: taken, weighed, carried, put back, dropped, left to the pilot."""
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -11,6 +12,7 @@ from arm_companion.record.recorder import Record
 from arm_companion.sim.grasp_verdict import GraspVerdict, judge_grasp
 from arm_companion.sim.runner import Result, fly_simulated
 from arm_companion.sim.scenario import Operator
+from arm_companion.sim.trials import draw
 from arm_companion.sim.world import World
 
 CONFIG = load("sim_grasp.toml")
@@ -64,6 +66,19 @@ def test_an_object_is_picked_up_weighed_carried_and_put_back_twice() -> None:
     wrench = {error.span: error for error in verdict.wrench}["carried"]
     assert wrench.force_error_n < 0.2 * wrench.true_force_n
     assert max(max(s.truth.tension) for s in result.flight.samples) < CONFIG.limits.tension_max_n
+
+
+@pytest.mark.scenario
+def test_a_heavy_object_that_wind_has_it_meet_beside_its_middle_is_put_back() -> None:
+    """Held 3 cm beside that, 297 g leaned the vehicle until it was 10 cm aside, and were lost."""
+    drawn = draw(load("sim_grasp.toml", ("sim.seed=500",)), 500)
+    script = Operator.fly_grasp_once
+    result = run_simulated(fly_simulated(drawn.controller, lambda _: None, world=drawn.world, fly=script))
+    verdict = judge_grasp(result.flight, result.failure, drawn.world)
+    assert verdict.success, verdict.reason
+    (lift,) = [span for span in result.flight.spans() if span[0] == "LIFT"]
+    asked = [(s, place) for s in result.flight.within(*lift[1:]) if (place := result.flight.asked_at(s.t)) is not None]
+    assert max(math.dist(s.state.position_w[:2], place[:2]) for s, place in asked) < 0.08
 
 
 @pytest.mark.scenario
