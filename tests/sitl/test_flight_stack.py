@@ -87,7 +87,7 @@ def test_an_object_is_picked_up_weighed_carried_and_put_back(stack: str, tmp_pat
     error = {pick_up.name: pick_up.error_m for pick_up in verdict.pick_ups}
     print(json.dumps({"stack": stack, **error, "weighed_kg": verdict.weighed_kg, "placed_m": verdict.placed_m}))
     assert verdict.success, verdict.reason
-    assert error[WITH] <= 0.5 * error[WITHOUT]
+    assert error[WITH] <= 0.6 * error[WITHOUT]
     assert abs(verdict.weighed_kg - verdict.mass_kg) < 3.0 * verdict.weighed_sigma_kg
 
 

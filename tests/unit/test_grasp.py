@@ -235,12 +235,14 @@ def test_an_object_that_lies_is_taken_by_the_push_before_the_vehicle_is_asked_up
         assert asked(run)[0][2] < PLACE[2] - 0.01, "a push that is as great as it may be has to be helped"
 
 
-@pytest.mark.parametrize(("age", "seconds", "follows"), [(0.0, 2.0, 1.0), (0.4, 0.2, 0.0)])
-def test_until_the_push_begins_the_place_of_the_pick_up_is_where_the_vehicle_rests(
-    parameters: Parameters, hovering: Hovering, age: float, seconds: float, follows: float
+@pytest.mark.parametrize(
+    ("begun", "age", "seconds", "follows"), [(0.0, 0.0, 2.0, 1.0), (2.4, 0.0, 0.4, 0.3), (0.0, 0.4, 0.2, 0.0)]
+)
+def test_until_the_push_could_lift_something_the_place_of_the_pick_up_is_where_the_vehicle_rests(
+    parameters: Parameters, hovering: Hovering, begun: float, age: float, seconds: float, follows: float
 ) -> None:
     """And not where the closing arm had it; of an old state nobody knows that it rests there."""
-    run = Run(carrying(Phase.VERIFY, up=0.0, now=0.0, task=Order.GRASP, since=T0), parameters)
+    run = Run(carrying(Phase.VERIFY, up=0.0, now=0.0, task=Order.GRASP, since=T0 - begun), parameters)
     run.cycles(vehicle(position_age_s=age)(aloft(hovering, 0.0, -0.01)), seconds)
     assert run.state.anchor is not None
     assert run.state.anchor.position_w[2] == pytest.approx(PLACE[2] + 0.01 * follows, abs=5e-4)
