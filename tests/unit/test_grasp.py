@@ -231,6 +231,8 @@ def test_an_object_that_lies_is_taken_by_the_push_before_the_vehicle_is_asked_up
         run.cycle(vehicle(control=Control.PILOT, mode="POSCTL")(aloft(hovering, MASS, 0.025)))
         assert run.state.load.before == 0.0, "whoever flies it next begins anew"
     else:
+        run.cycles(aloft(hovering, MASS, 0.005), 0.5)
+        assert asked(run)[0][2] == pytest.approx(PLACE[2] - 0.005, abs=1e-3), "where the load stretches it to"
         run.cycles(aloft(hovering, MASS, 0.0), 3.0)
         assert asked(run)[0][2] < PLACE[2] - 0.01, "a push that is as great as it may be has to be helped"
 
