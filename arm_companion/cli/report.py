@@ -37,15 +37,14 @@ def run(arguments: argparse.Namespace) -> int:
     from arm_companion.report.words import judge  # noqa: PLC0415
 
     log: Path = arguments.log
-    record = Reader(log)
-    truth, beside = None, arguments.truth or _truth_of(log)
-    if beside is not None:
+    record, truth = Reader(log), None
+    if arguments.truth:
+        truth = Reader(arguments.truth)
+    elif (beside := _truth_of(log)) is not None:
         try:
             truth = Reader(beside)
-        except RecordError as error:
-            if arguments.truth:
-                raise
-            record.remarks.append(str(error))  # the simulator was stopped as it wrote it; the flight is worth a page
+        except RecordError as error:  # the simulator was stopped as it wrote it; the flight is worth a page
+            record.remarks.append(str(error))
     flight = read(record, truth)
     verdict = judge(flight)
     output: Path = arguments.output or _beside(log)

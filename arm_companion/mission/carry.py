@@ -130,10 +130,10 @@ def settle(s: Situation) -> State:
     Up to a push that lifts no object yet: PX4's height wanders by a centimetre within half a second.
     """
     state, grasp = s.state, s.config.grasp
-    lies_s = _steady_s(s)
-    if _comes_on(s):
-        lies_s += _COMES_ON_S * grasp.mass_min_kg / grasp.mass_max_kg
-    if state.phase is not Phase.VERIFY or s.elapsed >= lies_s or state.anchor is None or not s.vehicle_fresh:
+    if state.phase is not Phase.VERIFY or state.anchor is None or not s.vehicle_fresh:
+        return state
+    pushed_s = _COMES_ON_S * grasp.mass_min_kg / grasp.mass_max_kg if _comes_on(s) else 0.0
+    if s.elapsed >= _steady_s(s) + pushed_s:
         return state
     rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
     return replace(state, rest=rest, anchor=replace(state.anchor, position_w=rest))
