@@ -13,7 +13,7 @@ from typing import Final
 
 from arm_companion.drivers.mavlink_link import MavlinkLink
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import SIGNED, Header, addressee
+from arm_companion.protocol.mavlink_frames import SIGNED, Header, addressee
 
 MOST_ROUTES: Final = 256
 """Components that are remembered on each link."""

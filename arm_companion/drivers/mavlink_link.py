@@ -24,7 +24,8 @@ from arm_companion.config.schema import LinkConfig, VehicleConfig
 from arm_companion.drivers.streams import Streams
 from arm_companion.errors import LinkError, ProtocolError
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import SIGNED, Header, MavlinkCodec, Message, Tap
+from arm_companion.protocol.mavlink import MavlinkCodec, Message, Tap
+from arm_companion.protocol.mavlink_frames import SIGNED, Header
 from arm_companion.protocol.signing import Signing
 from arm_companion.protocol.tunnel import tunnel, unwrap
 from arm_companion.transport.base import Opener, Transport

@@ -14,7 +14,8 @@ from arm_companion.drivers.access import sender_of
 from arm_companion.drivers.flight_stack import AUTOPILOT_COMPONENT
 from arm_companion.drivers.mavlink_link import MavlinkLink, Priority
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import MAGIC_V2, Message
+from arm_companion.protocol.mavlink import Message
+from arm_companion.protocol.mavlink_frames import MAGIC_V2
 
 PERIOD_S: Final = 0.5
 WINDOW: Final = 20

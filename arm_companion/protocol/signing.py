@@ -10,7 +10,7 @@ import hmac
 from typing import Final
 
 from arm_companion.errors import ProtocolError
-from arm_companion.protocol.mavlink import SIGNATURE_LENGTH, SIGNED, Header, checksum, crc_extra
+from arm_companion.protocol.mavlink_frames import SIGNATURE_LENGTH, SIGNED, Header, checksum, crc_extra
 
 KEY_LENGTH: Final = 32
 EPOCH_S: Final = 1_420_070_400

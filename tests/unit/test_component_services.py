@@ -10,7 +10,8 @@ import pytest
 from arm_companion.drivers.standard_services import Power
 from arm_companion.mission.facts import Answer, Notice, Order, Result, Severity
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import MavlinkCodec, checksum
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.mavlink_frames import checksum
 from arm_companion.protocol.tunnel import tunnel
 from tests.conftest import MavlinkPeer
 from tests.unit.component_rig import GCS, ServiceRig, serve

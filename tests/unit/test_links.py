@@ -23,7 +23,8 @@ from arm_companion.drivers.vehicle_check import VehicleCheck
 from arm_companion.errors import ConfigError
 from arm_companion.mission.facts import Notice, Severity
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import Header, MavlinkCodec
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.mavlink_frames import Header
 from arm_companion.protocol.signing import Signing, stamp_at
 from tests.conftest import MavlinkPeer
 from tests.unit.component_rig import GCS, ServiceRig, serve

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 
 from arm_companion.errors import ProtocolError
-from arm_companion.protocol import mavlink as codec_module
+from arm_companion.protocol import mavlink, mavlink_frames
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import MAGIC_V1, MAGIC_V2, MavlinkCodec, Message, _slow_crc
+from arm_companion.protocol.mavlink import MavlinkCodec, Message
+from arm_companion.protocol.mavlink_frames import MAGIC_V1, MAGIC_V2, _slow_crc
 
 RANGES = {
     "B": (0, 0xFF), "b": (-0x80, 0x7F), "H": (0, 0xFFFF), "h": (-0x8000, 0x7FFF),
@@ -168,14 +169,15 @@ def mavlink_1(message: Message, payload: bytes) -> bytes:
 
 def test_no_noise_makes_the_reader_look_at_the_same_bytes_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
     looks = 0
-    real = codec_module._frame_end
+    real = mavlink_frames.frame_end
 
     def counted(data: bytes, at: int) -> int:
         nonlocal looks
         looks += 1
         return real(data, at)
 
-    monkeypatch.setattr(codec_module, "_frame_end", counted)
+    for module in (mavlink, mavlink_frames):
+        monkeypatch.setattr(module, "frame_end", counted)
     good = mavlink_1(heartbeat(), b"")
     # At every other byte a start of a long frame with an unknown id, and in all of them the same good one.
     noise = (bytes([MAGIC_V1, 240]) * 120 + good) * 40

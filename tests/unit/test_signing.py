@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 
 from arm_companion.errors import ProtocolError
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import Header, MavlinkCodec
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.mavlink_frames import Header
 from arm_companion.protocol.signing import EPOCH_S, MOST_STREAMS, OLDEST_S, Signing, stamp_at
 
 KEY = bytes(range(32))

@@ -6,7 +6,8 @@ from hypothesis import given
 
 from arm_companion.errors import ProtocolError
 from arm_companion.protocol.dialect import mav
-from arm_companion.protocol.mavlink import _LAYOUTS, MavlinkCodec, _decode
+from arm_companion.protocol.mavlink import MavlinkCodec
+from arm_companion.protocol.mavlink_frames import LAYOUTS, decode
 from arm_companion.protocol.tunnel import CAPACITY, PAYLOAD_TYPE, tunnel, unwrap, wrap
 
 OURS = range(64000, 64007)
@@ -14,8 +15,8 @@ OURS = range(64000, 64007)
 
 def longest(id_: int) -> bytes:
     """A frame of the message without a zero byte to cut off."""
-    layout = _LAYOUTS[id_]
-    return MavlinkCodec(1, 192).encode(_decode(layout, b"\x01" * layout.size))
+    layout = LAYOUTS[id_]
+    return MavlinkCodec(1, 192).encode(decode(layout, b"\x01" * layout.size))
 
 
 @pytest.mark.parametrize("id_", OURS)

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import Final
 
 from arm_companion.protocol.dialect import XML, mav
-from arm_companion.protocol.mavlink import place_of
+from arm_companion.protocol.mavlink_frames import place_of
 
 _OURS: Final = range(64_000, 64_100)
 
