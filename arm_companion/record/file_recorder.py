@@ -32,6 +32,7 @@ from arm_companion.record.topics import (
     STARTS,
     STATE,
     TRANSITIONS,
+    bytes_message,
     log_message,
     transition,
 )
@@ -302,14 +303,14 @@ class FileRecorder(Recorder):
                 file.json(TRANSITIONS, now, {"t": t, "before": before, "after": after, "cause": cause})
         for frame in batch.frames:
             way = "sent" if frame.sent else "received"
-            file.raw(f"{RAW}{frame.pipe}/{way}", self._ns(frame.t), frame.data)
+            file.json(f"{RAW}{frame.pipe}/{way}", self._ns(frame.t), bytes_message(frame.t, frame.data))
         for cycle in batch.cycles:
             now = self._ns(cycle.t)
             if cycle.starts:
-                file.raw(STARTS, now, cycle.starts, cycle.sequence)
-            file.raw(FACTS, now, cycle.facts, cycle.sequence)
-            file.raw(STATE, now, cycle.state, cycle.sequence)
-            file.raw(cycle.topic, now, cycle.outcome, cycle.sequence)
+                file.text(STARTS, now, cycle.starts, cycle.sequence)
+            file.text(FACTS, now, cycle.facts, cycle.sequence)
+            file.text(STATE, now, cycle.state, cycle.sequence)
+            file.text(cycle.topic, now, cycle.outcome, cycle.sequence)
 
     def _write_config(self, file: McapFile, t: float, config: Config) -> None:
         file.json(CONFIGURATION, self._ns(t), {"t": t, "config": as_table(config)})

@@ -96,10 +96,10 @@ class McapFile:
 
     def json(self, topic: str, unix_ns: int, value: dict[str, Any], sequence: int = 0) -> None:
         """Add a structured message."""
-        self.raw(topic, unix_ns, orjson.dumps(value), sequence)
+        self.text(topic, unix_ns, orjson.dumps(value), sequence)
 
-    def raw(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
-        """Add bytes as they are."""
+    def text(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
+        """Add a message that is JSON already."""
         channel = self._numbers.get(topic) or self._add_channel(topic)
         self._open.add(channel, unix_ns, data, sequence)
         if self._open.size > _CHUNK:
@@ -125,14 +125,14 @@ class McapFile:
             self._stream.close()
 
     def _add_channel(self, topic: str) -> int:
-        schema, encoding = 0, "application/octet-stream"
-        if topic in SCHEMAS:
-            name, text = schema_text(topic)
-            schema, encoding = len(self._schemas) + 1, "json"
+        name, text = schema_text(topic)
+        schema = next((known.id for known in self._schemas if known.name == name), 0)
+        if not schema:
+            schema = len(self._schemas) + 1
             self._schemas.append(Schema(id=schema, name=name, encoding="jsonschema", data=text))
             self._open.define(self._schemas[-1])
         number = len(self._channels) + 1
-        self._channels.append(Channel(id=number, topic=topic, message_encoding=encoding, metadata={}, schema_id=schema))
+        self._channels.append(Channel(id=number, topic=topic, message_encoding="json", metadata={}, schema_id=schema))
         self._open.define(self._channels[-1])
         self._numbers[topic] = number
         return number

@@ -2,8 +2,12 @@
 
 Every structured message is JSON with the loop time `t` (s) first; its log time is the Unix time of the same instant.
 A number that is not finite is one of the strings "nan", "inf" and "-inf", which plots leave out.
+
+The schemas keep to what Foxglove's reader takes, and it refuses all of a channel for one field that it does not: every
+level is an object, a value of one kind or an array of these, never an array of arrays.
 """
 
+import base64
 import dataclasses
 import enum
 import json
@@ -32,7 +36,7 @@ LOG: Final = "/log"
 CONFIGURATION: Final = "/configuration"
 TRUTH: Final = "/truth"
 RAW: Final = "/raw/"
-"""What a raw channel's name begins with; then the pipe, then /sent or /received. Its messages are the bytes alone."""
+"""What a raw channel's name begins with; then the pipe, then /sent or /received."""
 
 _TRANSITION = re.compile(r"([A-Z]+) -> ([A-Z]+): (.*)", re.DOTALL)
 _NUMBER: Final = {"type": "number"}
@@ -63,8 +67,14 @@ def schema(hint: Any) -> dict[str, Any]:
         return _STRING
     if dataclasses.is_dataclass(hint):
         kind: Any = hint
-        return {"type": "object", "properties": {name: schema(inner) for name, inner in fields(kind).items()}}
+        tables = {name: schema(inner) for name, inner in fields(kind).items()}
+        return {"type": "object", "properties": {name: table for name, table in tables.items() if not _nested(table)}}
     return {"type": {float: "number", int: "integer", bool: "boolean"}.get(hint, "string")}
+
+
+def _nested(table: dict[str, Any]) -> bool:
+    """Whether it is an array of arrays, such as a matrix: it stands in the messages all the same."""
+    return bool(table["type"] == "array" and table["items"]["type"] == "array")
 
 
 def _timed(table: dict[str, Any]) -> dict[str, Any]:
@@ -115,11 +125,22 @@ SCHEMAS: Final[dict[str, tuple[str, dict[str, Any]]]] = {
 }
 """Name and JSON schema of every channel but the raw ones."""
 
+BYTES: Final = (
+    "arm_companion.Bytes",
+    _timed({"properties": {"data": {"type": "string", "contentEncoding": "base64"}}}),
+)
+"""The same of all raw channels."""
+
 
 def schema_text(topic: str) -> tuple[str, bytes]:
     """Name and text of a channel's schema."""
-    name, table = SCHEMAS[topic]
+    name, table = BYTES if topic.startswith(RAW) else SCHEMAS[topic]
     return name, json.dumps(table).encode()
+
+
+def bytes_message(t: float, data: bytes) -> dict[str, Any]:
+    """Bytes of a pipe as a raw channel has them."""
+    return {"t": t, "data": base64.b64encode(data).decode()}
 
 
 def transition(text: str) -> tuple[str, str, str] | None:

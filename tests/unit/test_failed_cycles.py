@@ -147,7 +147,7 @@ def test_a_record_without_the_channel_of_failures_is_read_as_before(record: Path
     file = McapFile(path, reader.versions)
     for item in reader:
         if item.sequence not in FAILING or item.topic not in {FACTS, STATE, FAILURES}:
-            file.raw(item.topic, item.unix_ns, item.data, item.sequence)
+            file.text(item.topic, item.unix_ns, item.data, item.sequence)
     file.close()
     outcome = replay(Reader(path))
     assert outcome.gaps == [(30, 3)]

@@ -142,10 +142,10 @@ def test_a_record_is_written_out_on_a_slow_disk_and_what_a_dead_one_costs_is_tol
     release, cycles = threading.Event(), 100
 
     class Slow(McapFile):
-        def raw(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
+        def text(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
             if topic == FACTS:
                 release.wait(30.0 if dead and sequence == 60 else 0.015)
-            super().raw(topic, unix_ns, data, sequence)
+            super().text(topic, unix_ns, data, sequence)
 
         def sync(self) -> None:
             pytest.fail("the end waits for no disk to have it all")

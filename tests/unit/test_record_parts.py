@@ -122,8 +122,8 @@ def test_behind_a_full_disk_a_part_begins_that_is_replayed_alone(tmp_path: Path)
 
         most = 30_000
 
-        def raw(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
-            super().raw(topic, unix_ns, data, sequence)
+        def text(self, topic: str, unix_ns: int, data: bytes, sequence: int = 0) -> None:
+            super().text(topic, unix_ns, data, sequence)
             if self.size > self.most and topic == FACTS:
                 Full.most = 10**9
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))

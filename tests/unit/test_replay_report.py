@@ -53,7 +53,7 @@ def copy(target: Path, *, skip: range = range(0), upto: int = 10**9, **about: st
     file = McapFile(target, {**reader.versions, **about})
     for item in reader:
         if item.sequence not in skip and item.sequence < upto:
-            file.raw(item.topic, item.unix_ns, item.data, item.sequence)
+            file.text(item.topic, item.unix_ns, item.data, item.sequence)
     file.close()
 
 
@@ -138,7 +138,7 @@ def remembered(
             continue
         if before.prediction is not None and not found.number % 20:
             start = first if found.number == other_start else before
-            file.raw(STARTS, 0, starts_text(start, found.t), found.number)
+            file.text(STARTS, 0, starts_text(start, found.t), found.number)
         file.json(STATE, 0, plain(before), found.number)
         file.json(FACTS, 0, {"t": found.t} | plain(found.facts), found.number)
         file.json(COMMANDS, 0, {"t": found.t} | plain(commands), found.number)
@@ -246,7 +246,7 @@ def test_a_cycle_that_this_version_does_not_know_is_refused(tmp_path: Path, caps
         if item.sequence > 2:
             break
         data = item.data.replace(b'"vehicle"', b'"airframe"') if item.topic == "/facts" else item.data
-        file.raw(item.topic, item.unix_ns, data, item.sequence)
+        file.text(item.topic, item.unix_ns, data, item.sequence)
     file.close()
     assert main(["replay", str(path)]) == 1
     assert "version 9.9" in capsys.readouterr().err
@@ -287,7 +287,7 @@ def test_the_report_is_one_page_that_needs_nothing_else(tmp_path: Path, capsys: 
     for item in reader:
         if item.topic == COMMANDS:
             start = start or item.unix_ns
-        file.raw(item.topic, item.unix_ns, item.data, item.sequence)
+        file.text(item.topic, item.unix_ns, item.data, item.sequence)
     warning = "tendon 3 <b>slack</b> & warm"
     file.json(LOG, start + 10**9, {"level": 3, "message": warning})
     file.close()
@@ -366,7 +366,7 @@ def altered(target: Path, change: Callable[[int, dict[str, Any], dict[str, Any]]
             for topic, table in ((FACTS, facts), (COMMANDS, commands)):
                 file.json(topic, 10**18 + item.sequence * 10**7, table | {"t": 0.01 * item.sequence}, item.sequence)
         elif item.topic == CONFIGURATION:
-            file.raw(item.topic, 10**18, item.data)
+            file.text(item.topic, 10**18, item.data)
     file.close()
 
 
