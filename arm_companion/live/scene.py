@@ -1,7 +1,9 @@
 """What the 3-D panel shows, as Foxglove's scene: vehicle, arm, bar, and the predicted wrench as arrows.
 
 Frames: `map` is east-north-up as Foxglove likes it, `world` our north-east-down, `body` the airframe (FRD), `arm_base`
-the arm's. All that is drawn stands in `body`, and goes away a second after the last message.
+the arm's. `vehicle` is where the airframe is, but upright as the map: a camera that follows `body` itself keeps its
+orientation, and shows everything upside down. All that is drawn stands in `body`, and goes away a second after the
+last message.
 """
 
 import math
@@ -31,8 +33,8 @@ from foxglove.messages import (
 Vector: TypeAlias = Sequence[float]
 
 _LIFETIME: Final = Duration(sec=1, nsec=0)
-_METRES_PER_N: Final = 0.03
-_METRES_PER_NM: Final = 0.15
+_METRES_PER_N: Final = 0.06
+_METRES_PER_NM: Final = 0.3
 _ROTORS: Final = ((0.17, 0.17), (0.17, -0.17), (-0.17, 0.17), (-0.17, -0.17))
 _BAR_LENGTH: Final = 1.5
 _GREY: Final = Color(r=0.45, g=0.48, b=0.52, a=1.0)
@@ -47,6 +49,7 @@ _RED: Final = Color(r=0.85, g=0.15, b=0.12, a=1.0)
 _VIOLET: Final = Color(r=0.6, g=0.25, b=0.8, a=1.0)
 # 180 degrees about north-east: swaps north and east, and turns down up
 _MAP_WORLD: Final = Quaternion(w=0.0, x=math.sqrt(0.5), y=math.sqrt(0.5), z=0.0)
+_UPRIGHT: Final = Quaternion(w=1.0, x=0.0, y=0.0, z=0.0)
 
 
 def turn_to(axis: Vector, direction: Vector) -> tuple[float, float, float, float]:
@@ -67,7 +70,9 @@ def transforms(ns: int, table: dict[str, Any]) -> FrameTransforms:
     """Where the frames stand; the vehicle's only while its state is fresh."""
     frames = [("map", "world", (0.0, 0.0, 0.0), _MAP_WORLD)]
     if table["fresh"]:
-        frames.append(("world", "body", table["position_w"], _quaternion(table["attitude_wb"])))
+        north, east, down = table["position_w"]
+        frames.append(("world", "body", (north, east, down), _quaternion(table["attitude_wb"])))
+        frames.append(("map", "vehicle", (east, north, -down), _UPRIGHT))
     frames.append(("body", "arm_base", table["mount"], _quaternion(table["mount_attitude"])))
     return FrameTransforms(
         transforms=[
@@ -85,7 +90,7 @@ def transforms(ns: int, table: dict[str, Any]) -> FrameTransforms:
 
 def scene(ns: int, table: dict[str, Any]) -> SceneUpdate:
     """What is drawn, of the table that `live.feed` makes."""
-    entities = [_vehicle(ns), _arm(ns, table["backbone"], table["disk_radius"])]
+    entities = [_vehicle(ns, table["mount"]), _arm(ns, table["backbone"], table["disk_radius"])]
     if table["bar"] is not None:
         entities.append(_bar(ns, table["bar"]))
     if table["keep_out"] is not None:
@@ -95,8 +100,9 @@ def scene(ns: int, table: dict[str, Any]) -> SceneUpdate:
     return SceneUpdate(entities=entities)
 
 
-def _vehicle(ns: int) -> SceneEntity:
-    spokes = [Point3(x=s * x, y=s * y, z=0.0) for x, y in _ROTORS for s in (0.0, 1.0)]
+def _vehicle(ns: int, mount: Vector) -> SceneEntity:
+    ends = [(x, y, 0.0) for x, y in _ROTORS] + [mount]
+    spokes = [Point3(x=s * x, y=s * y, z=s * z) for x, y, z in ends for s in (0.0, 1.0)]
     line = LinePrimitive(type=LinePrimitiveLineType.LineList, thickness=0.015, points=spokes, color=_GREY)
     rotors = [
         CylinderPrimitive(
@@ -104,7 +110,7 @@ def _vehicle(ns: int) -> SceneEntity:
         )
         for x, y in _ROTORS
     ]
-    hull = CubePrimitive(pose=_pose((0.0, 0.0, 0.0)), size=Vector3(x=0.12, y=0.08, z=0.05), color=_GREY)
+    hull = CubePrimitive(pose=_pose((0.0, 0.0, 0.0)), size=Vector3(x=0.12, y=0.08, z=0.05), color=_PALE)
     return _entity(ns, "vehicle", lines=[line], cylinders=rotors, cubes=[hull])
 
 

@@ -13,6 +13,7 @@ from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import websockets
 from mcap.reader import make_reader
@@ -306,6 +307,31 @@ def test_every_path_of_the_layout_names_something_that_is_sent() -> None:
                 schema = schema["items"]
         assert schema["type"] in {"number", "string"}, path
     assert panels["RosOut!log"]["topicToRender"] == LOG
+    frames = repr(transforms(1, table(held=True)))
+    camera = panels["3D!scene"]
+    for name in [camera["followTf"], *(key.removeprefix("frame:") for key in camera["transforms"])]:
+        assert f'"{name}"' in frames, name
+
+
+@pytest.mark.parametrize("attitude", [(1.0, 0.0, 0.0, 0.0), (0.9, 0.3, -0.1, 0.3)])
+def test_the_camera_follows_the_vehicle_and_stays_upright(attitude: tuple[float, ...]) -> None:
+    """Through both ways of the tree: `vehicle` is where `body` is, and its third axis points up."""
+    drawn = table(held=True) | {"fresh": True, "attitude_wb": attitude, "position_w": (1.0, 2.0, -3.0)}
+    poses = {"map": (np.eye(3), np.zeros(3))}
+    for parent, child, place, turn in re.findall(
+        r'parent_frame_id: "(\w+)", child_frame_id: "(\w+)".*?Vector3 \{ (.*?) \}.*?Quaternion \{ (.*?) \}',
+        repr(transforms(1, drawn)),
+    ):
+        p = np.array([float(number) for number in re.findall(r": (\S+?)(?:,|$)", place)])
+        x, y, z, w = (float(number) for number in re.findall(r": (\S+?)(?:,|$)", turn))
+        R0, p0 = poses[parent]
+        q = np.array((w, x, y, z))
+        poses[child] = R0 @ so3.from_quaternion(q / np.linalg.norm(q)), p0 + R0 @ p
+    R, p = poses["vehicle"]
+    assert p == pytest.approx(poses["body"][1])
+    assert p == pytest.approx((2.0, 1.0, 3.0)), "east, north, up"
+    assert R[:, 2] == pytest.approx((0.0, 0.0, 1.0))
+    assert poses["world"][0][:, 2] == pytest.approx((0.0, 0.0, -1.0))
 
 
 def test_a_record_has_the_same_channels() -> None:
