@@ -1,13 +1,18 @@
-"""Where the vehicle goes beside a bar or object that the arm has met, while it has not yet gripped it or lets it go."""
+"""Beside a bar or object that the arm has met: where the vehicle goes before the grip and as it opens, and its rest."""
 
 import math
 
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import add, dot, scale, sub
-from arm_companion.mission.situation import Situation
+from arm_companion.mission.motion import ZERO, add, dot, scale, sub
+from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import PerchKind, Phase
 
+_SETTLE_S = 2.5
+_RESTED_S = 0.5
+_RESTLESS_S = 8.0
+_AT_BAR_M = 0.03
+_NEARER_M = 0.01
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 
 
@@ -53,3 +58,20 @@ def curling(s: Situation) -> Vec3:
 def clear(s: Situation) -> Vec3:
     """Vehicle position from which the straight arm leaves room for a curl, world axes, m."""
     return add(s.contact_w, scale(s.ahead, -s.config.perch.wrap_clearance_m))
+
+
+def settled(s: Situation) -> str | None:
+    """The vehicle rests just clear of the bar that it touched."""
+    reference = s.state.reference
+    if reference is None or s.elapsed < _SETTLE_S or reference.velocity != ZERO:
+        return None
+    # the blow of the bar throws it back and forth: one that passes by on its way does not rest, one in wind never will
+    # nearer to the bar than it should be it waits on: the curl would meet the bar before it closes
+    nearer = dot(sub(s.facts.vehicle.position_w, reference.position), s.ahead)
+    near = s.elapsed > _RESTLESS_S and nearer <= _NEARER_M and at(s, reference.position, _AT_BAR_M)
+    return "settled clear of the bar" if near or s.state.vigil.rested_s >= _RESTED_S else None
+
+
+def settled_at_object(s: Situation) -> str | None:
+    """The same of an object that is to be grasped."""
+    return settled(s) if s.grasping else None

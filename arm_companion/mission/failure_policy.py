@@ -184,6 +184,12 @@ CAUSES: tuple[Cause, ...] = (
         "does not apply",
     ),
     Cause(
+        "vehicle rocks about what it holds",
+        ArmFault.GRIP_TEST_FAILED,
+        (hazards.rocks,),
+        "nothing: it is judged where a grip is tested",
+    ),
+    Cause(
         "wrench over its limit",
         ArmFault.WRENCH_LIMIT,
         (hazards.wrench_over_limit,),

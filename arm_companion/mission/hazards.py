@@ -16,6 +16,8 @@ _BLIND_S = 0.5
 _UNHEARD_S = 5.0  # longer than servos take to be set up
 _GROUND_LOST_S = 5.0
 _TIGHT_S = 0.1
+_ROCKS_RAD_PER_S = 0.3  # root mean square; what is held well stays under 0.1, in wind too
+_CALM_S = 2.0  # from the closing of the arm, which pulls the vehicle about
 _FAR_OVER = 1.15  # times the limit; a reading's noise is a twelfth of it, one sigma
 _OVERRUN_S = 0.1  # the longest step that a cycle believes
 
@@ -113,6 +115,18 @@ def wrench_over_limit(s: Situation) -> str | None:
     if torque > limits.wrench_moment_nm:
         return f"{torque:.2f} N m on the airframe is over {limits.wrench_moment_nm:g} N m"
     return None
+
+
+def rocks(s: Situation) -> str | None:
+    """The vehicle rocks about what the arm has closed around, and does not come to rest.
+
+    Close above its grip it is a pendulum upside down, which the autopilot holds upright with loops that are made for
+    free flight. The arm's stiffness helps as long as the grip does not give: thrown far enough, it goes on for ever.
+    """
+    rate = math.sqrt(s.state.vigil.rocking)
+    if s.elapsed < _CALM_S or rate <= _ROCKS_RAD_PER_S:
+        return None
+    return f"the vehicle rocks about what the arm holds, at {math.degrees(rate):.0f} deg/s"
 
 
 # --- the vehicle's path ---

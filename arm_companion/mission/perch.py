@@ -5,7 +5,7 @@ The rows of the grasp, which shares the way to its object and back, come from `g
 Abort rows stand first and therefore win. A row's guard returns its reason in words.
 """
 
-from arm_companion.mission import calibrating, grasp, gripper, hang, jog, pressing, reach_table, tries
+from arm_companion.mission import beside, calibrating, grasp, gripper, hang, jog, pressing, reach_table, tries
 from arm_companion.mission.estimate import strength
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
@@ -19,6 +19,7 @@ from arm_companion.mission.hazards import (
     motors_stopped,
     overstressed,
     pilot_takes_over,
+    rocks,
     servo_fault,
     servo_limp,
     tendon_broken,
@@ -48,10 +49,6 @@ _CONTACT_PERSISTS_S = 0.15
 _SETTLE_S = 1.0
 _BACK_M = 0.002
 _AT_LIMIT_RAD = 1e-6
-_CONTACT_SETTLE_S = 2.5
-_RESTED_S = 0.5
-_RESTLESS_S = 8.0
-_AT_BAR_M = 0.03
 _POSE_CHECKED_RAD = 0.15
 _ADOPT_BEND_RAD = 0.3
 _CLEAR_BEND_RAD = 0.25
@@ -174,21 +171,6 @@ def contact_found(s: Situation) -> str | None:
     if s.state.force.above_s < _CONTACT_PERSISTS_S:
         return None
     return f"contact: {strength(s.state.force.residual):.1f} N beyond what the free arm explains"
-
-
-def contact_settled(s: Situation) -> str | None:
-    """The vehicle rests just clear of the bar that it touched."""
-    reference = s.state.reference
-    if reference is None or s.elapsed < _CONTACT_SETTLE_S or reference.velocity != ZERO:
-        return None
-    # the blow of the bar throws it back and forth: one that passes by on its way does not rest, one in wind never will
-    near = s.elapsed > _RESTLESS_S and at(s, reference.position, _AT_BAR_M)
-    return "settled clear of the bar" if near or s.state.vigil.rested_s >= _RESTED_S else None
-
-
-def settled_at_object(s: Situation) -> str | None:
-    """The same of an object that is to be grasped."""
-    return contact_settled(s) if s.grasping else None
 
 
 def wrapped_to_the_limit(s: Situation) -> bool:
@@ -365,6 +347,7 @@ TABLE: Table[Phase, Situation] = Table(
         *reach_table.ABORTS,
         *calibrating.ABORTS,
         # progress
+        *tries.or_fail(Phase.VERIFY, rocks, Phase.UNLOAD, "vehicle rocks", ArmFault.GRIP_TEST_FAILED),
         *grasp.PROGRESS,
         *calibrating.PROGRESS,
         *hang.PROGRESS,
@@ -376,8 +359,8 @@ TABLE: Table[Phase, Situation] = Table(
         Row(frozenset({Phase.APPROACH}), at_standoff, Phase.REACH, "at stand-off"),
         Row(frozenset({Phase.REACH}), contact_found, Phase.CONTACT, "contact found"),
         *tries.or_fail(Phase.REACH, no_contact, Phase.DEPART, "no contact", ArmFault.NO_CONTACT),
-        Row(frozenset({Phase.CONTACT}), settled_at_object, Phase.CLOSE, "settled at the object"),
-        Row(frozenset({Phase.CONTACT}), contact_settled, Phase.WRAP, "settled"),
+        Row(frozenset({Phase.CONTACT}), beside.settled_at_object, Phase.CLOSE, "settled at the object"),
+        Row(frozenset({Phase.CONTACT}), beside.settled, Phase.WRAP, "settled"),
         Row(frozenset({Phase.WRAP}), gripped, Phase.VERIFY, "grip tension"),
         *tries.or_fail(Phase.WRAP, no_grip, Phase.UNLOAD, "no grip", ArmFault.GRIP_TEST_FAILED),
         Row(frozenset({Phase.VERIFY}), pull_test_passed, Phase.PERCHED, "pull test passed"),

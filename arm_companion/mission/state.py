@@ -154,6 +154,7 @@ class Vigil:
         blind_s: the mechanics have no solution.
         unheard_s: a servo has not been heard.
         rested_s: the vehicle is where a reference at rest has it.
+        rocking: mean square of its rates of roll and pitch over the last second or so, (rad/s)^2.
         jumps: of the estimator, loop time and way, m: what is told after one is in its frame.
         jumped_at: loop time of the last jump.
         leap_m: its size.
@@ -170,6 +171,7 @@ class Vigil:
     blind_s: float = 0.0
     unheard_s: float = 0.0
     rested_s: float = 0.0
+    rocking: float = 0.0
     jumps: tuple[tuple[float, Vec3], ...] = ()
     jumped_at: float = 0.0
     leap_m: float = 0.0

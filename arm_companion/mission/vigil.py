@@ -21,6 +21,7 @@ _BURST_M_PER_S2 = 0.75  # a quarter of the acceleration with which a hover ends 
 _JUMPS = 8  # that are remembered one by one
 _AWAY_S = 3.0
 _RESTS_M = 0.02
+_ROCKING_S = 1.0
 _ASTRAY_M = 0.5  # the reference moves at half a metre a second, and a multirotor lags it by less than a second
 
 
@@ -63,6 +64,7 @@ def keep_vigil(s: Situation) -> State:
         blind_s=time(before.blind_s, holds=_blind(s)),
         unheard_s=time(before.unheard_s, holds=not s.heard),
         rested_s=time(before.rested_s, holds=_rests(s)),
+        rocking=_rocking(s, before.rocking),
     )
     return replace(state, vigil=vigil)
 
@@ -87,6 +89,12 @@ def _rests(s: Situation) -> bool:
     if reference is None or reference.velocity != ZERO or not s.vehicle_fresh:
         return False
     return at(s, reference.position, _RESTS_M)
+
+
+def _rocking(s: Situation, before: float) -> float:
+    roll, pitch, _ = s.facts.vehicle.rate_b
+    now = roll * roll + pitch * pitch
+    return before + s.dt / (_ROCKING_S + s.dt) * (now - before) if s.vehicle_fresh and math.isfinite(now) else before
 
 
 def _blind(s: Situation) -> bool:

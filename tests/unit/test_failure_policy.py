@@ -33,7 +33,7 @@ from arm_companion.mission.parameters import Parameters
 from arm_companion.mission.payload import Load, ThrustCurve
 from arm_companion.mission.sharing import SUSPENDED
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction, State
+from arm_companion.mission.state import CALIBRATES, CARRYING, Phase, Prediction, State, Vigil
 from arm_companion.mission.tendon_watch import TendonWatch
 from arm_companion.procedures.tendon_zeros import Zero
 from tests.unit.conftest import tendons
@@ -211,6 +211,9 @@ PROVOCATIONS: dict[str, Provocation] = {
     ),
     "stiffness test failed": Provocation(
         "no grip|closed around nothing|pull test failed", moved((-0.04, 0.0, 0.0)), _pulled_off
+    ),
+    "vehicle rocks about what it holds": Provocation(
+        "rocks about", recall=_remember(vigil=Vigil(rocking=0.25), since=T0 - 2.5)
     ),
     "wrench over its limit": Provocation(
         "on the airframe",

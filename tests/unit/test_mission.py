@@ -136,14 +136,52 @@ def test_an_arm_is_wrapped_only_once_the_vehicle_rests_beside_the_bar(
     assert state.phase is Phase.WRAP
 
 
-def test_a_vehicle_that_never_quite_rests_wraps_all_the_same(parameters: Parameters, hovering: Hovering) -> None:
+@pytest.mark.parametrize("off", [(-0.025, 0.0), (0.008, 0.02)], ids=["farther from the bar", "aside"])
+def test_a_vehicle_that_never_quite_rests_wraps_all_the_same(
+    parameters: Parameters, hovering: Hovering, off: tuple[float, float]
+) -> None:
     clear = parameters.config.perch.wrap_clearance_m
     state = dataclasses.replace(at(Phase.CONTACT, contact_w=(2.0 + clear, 0.0, -2.2)), since=100.0)
-    restless = hovering(position_w=(2.025, 0.0, -2.2))
+    restless = hovering(position_w=(2.0 + off[0], off[1], -2.2))
     state, _ = run(state, restless, parameters, 7.8)
     assert state.phase is Phase.CONTACT
     state, _ = run(state, restless, parameters, 0.4)
     assert state.phase is Phase.WRAP
+
+
+def test_nearer_to_the_bar_than_it_should_be_it_waits_on(parameters: Parameters, hovering: Hovering) -> None:
+    """The curl would meet the bar before it closes, throw the vehicle back, and have it rock about the grip."""
+    clear = parameters.config.perch.wrap_clearance_m
+    state = dataclasses.replace(at(Phase.CONTACT, contact_w=(2.0 + clear, 0.0, -2.2)), since=100.0)
+    state, _ = run(state, hovering(position_w=(2.022, 0.0, -2.2)), parameters, 12.0)
+    assert state.phase is Phase.CONTACT
+    state, _ = run(state, hovering(position_w=(2.008, 0.0, -2.2)), parameters, 0.6)
+    assert state.phase is Phase.WRAP
+
+
+@pytest.mark.parametrize(("amplitude", "lets_go"), [(0.25, False), (0.6, True)])
+def test_a_vehicle_that_rocks_about_its_grip_lets_go_and_another_that_comes_to_rest_does_not(
+    parameters: Parameters, hovering: Hovering, amplitude: float, lets_go: bool
+) -> None:
+    state = dataclasses.replace(at(Phase.VERIFY, anchor=ANCHOR), since=100.0)
+    seconds = 0.0
+    while state.phase is Phase.VERIFY and seconds < 2.5:
+        rate = amplitude * math.sin(2.8 * seconds)
+        rocking = hovering(position_w=(2.0, 0.0, -2.2), rate_b=(0.0, rate, 0.0))
+        state, _ = run(state, rocking, parameters, DT)
+        seconds += DT
+    assert (state.phase is Phase.UNLOAD) is lets_go
+    assert not lets_go or 1.9 < seconds < 2.2, "a blow of the closing arm is waited out"
+
+
+@pytest.mark.parametrize("rate", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, 3.0)], ids=str)
+def test_rates_that_are_no_numbers_and_turns_about_the_vertical_are_no_rocking(
+    parameters: Parameters, hovering: Hovering, rate: tuple[float, float, float]
+) -> None:
+    state = dataclasses.replace(at(Phase.VERIFY, anchor=ANCHOR), since=100.0)
+    state, _ = run(state, hovering(position_w=(2.0, 0.0, -2.2), rate_b=rate), parameters, 2.5)
+    assert state.phase is Phase.VERIFY
+    assert state.vigil.rocking == 0.0
 
 
 @pytest.mark.parametrize("phase", [Phase.STOWED, Phase.APPROACH, Phase.PERCHED, Phase.HOLDING])
