@@ -4,7 +4,7 @@ import math
 
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, add, dot, scale, sub
+from arm_companion.mission.motion import ZERO, add, dot, norm, scale, sub
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import PerchKind, Phase
 
@@ -13,6 +13,7 @@ _RESTED_S = 0.5
 _RESTLESS_S = 8.0
 _AT_BAR_M = 0.03
 _NEARER_M = 0.01
+_ASIDE_M = 0.01
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 
 
@@ -65,9 +66,13 @@ def settled(s: Situation) -> str | None:
     reference = s.state.reference
     if reference is None or s.elapsed < _SETTLE_S or reference.velocity != ZERO:
         return None
-    # the blow of the bar throws it back and forth: one that passes by on its way does not rest, one in wind never will
-    # nearer to the bar than it should be it waits on: the curl would meet the bar before it closes
-    nearer = dot(sub(s.facts.vehicle.position_w, reference.position), s.ahead)
+    # The blow of the bar throws it back and forth: one that passes by on its way does not rest, one in wind never will.
+    # Nearer to the bar than it should be it waits on: the curl would meet the bar before it closes. Aside of the middle
+    # of an object it does, too: what is heavy, and held there, leans the vehicle, and meets its place with one end.
+    off = sub(s.facts.vehicle.position_w, reference.position)
+    nearer = dot(off, s.ahead)
+    if s.grasping and norm((*sub(off, scale(s.ahead, nearer))[:2], 0.0)) > _ASIDE_M:
+        return None
     near = s.elapsed > _RESTLESS_S and nearer <= _NEARER_M and at(s, reference.position, _AT_BAR_M)
     return "settled clear of the bar" if near or s.state.vigil.rested_s >= _RESTED_S else None
 

@@ -159,6 +159,16 @@ def test_nearer_to_the_bar_than_it_should_be_it_waits_on(parameters: Parameters,
     assert state.phase is Phase.WRAP
 
 
+def test_an_object_is_not_closed_around_beside_its_middle(parameters: Parameters, hovering: Hovering) -> None:
+    clear = parameters.config.perch.wrap_clearance_m
+    state = at(Phase.CONTACT, contact_w=(2.0 + clear, 0.0, -2.2), task=Order.GRASP)
+    state = dataclasses.replace(state, since=100.0)
+    state, _ = run(state, hovering(position_w=(2.0, 0.015, -2.2)), parameters, 12.0)
+    assert state.phase is Phase.CONTACT
+    state, _ = run(state, hovering(position_w=(1.98, 0.008, -2.18)), parameters, 0.6)
+    assert state.phase is Phase.CLOSE, "height and the way towards it matter less"
+
+
 @pytest.mark.parametrize(("amplitude", "lets_go"), [(0.25, False), (0.6, True)])
 def test_a_vehicle_that_rocks_about_its_grip_lets_go_and_another_that_comes_to_rest_does_not(
     parameters: Parameters, hovering: Hovering, amplitude: float, lets_go: bool
