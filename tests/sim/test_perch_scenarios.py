@@ -1,6 +1,7 @@
 """Whole flights in simulated time: plant, autopilot stand-in, servos and daemon, joined by bytes alone."""
 
 import atexit
+import base64
 import functools
 import json
 import shutil
@@ -169,7 +170,8 @@ def test_the_record_has_every_cycle_every_frame_and_every_sentence() -> None:
     for pipe in ("servos", "mavlink/autopilot", "mavlink/ground"):
         assert len(found[f"{RAW}{pipe}/sent"]) > 100, pipe
     codec = MavlinkCodec(255, 190)
-    heard = [m for item in found[f"{RAW}mavlink/autopilot/received"] for m in codec.feed(item.data)]
+    received = [json.loads(item.data)["data"] for item in found[f"{RAW}mavlink/autopilot/received"]]
+    heard = [m for data in received for m in codec.feed(base64.b64decode(data))]
     assert {"HEARTBEAT", "ATTITUDE_QUATERNION"} <= {message.get_type() for message in heard}
 
 
