@@ -13,6 +13,7 @@ from arm_companion.mission.motion import (
     add,
     clip_norm,
     follow,
+    low_pass_vec,
     norm,
     ramp,
     scale,
@@ -340,7 +341,7 @@ def _rest(s: Situation) -> Vec3 | None:
     )
     if state.phase is not Phase.PERCHED or moving or not s.vehicle_fresh:
         return state.rest
-    return add(s.rest, scale(sub(state.position, s.rest), s.dt / (_REST_S + s.dt)))
+    return low_pass_vec(s.rest, state.position, s.dt, _REST_S)
 
 
 def _lean(s: Situation) -> Vec3:

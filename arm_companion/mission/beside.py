@@ -4,7 +4,7 @@ import math
 
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, add, dot, norm, scale, sub
+from arm_companion.mission.motion import ZERO, add, dot, scale, sub
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import PerchKind, Phase
 
@@ -71,7 +71,7 @@ def settled(s: Situation) -> str | None:
     # of an object it does, too: what is heavy, and held there, leans the vehicle, and meets its place with one end.
     off = sub(s.facts.vehicle.position_w, reference.position)
     nearer = dot(off, s.ahead)
-    if s.grasping and norm((*sub(off, scale(s.ahead, nearer))[:2], 0.0)) > _ASIDE_M:
+    if s.grasping and abs(off[0] * s.ahead[1] - off[1] * s.ahead[0]) > _ASIDE_M:
         return None
     near = s.elapsed > _RESTLESS_S and nearer <= _NEARER_M and at(s, reference.position, _AT_BAR_M)
     return "settled clear of the bar" if near or s.state.vigil.rested_s >= _RESTED_S else None

@@ -9,7 +9,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission import gripper
 from arm_companion.mission.facts import PayloadReport, Vec3
 from arm_companion.mission.grasp import LIGHT_SHARE, low
-from arm_companion.mission.motion import ZERO, add, norm, scale, sub
+from arm_companion.mission.motion import ZERO, add, low_pass, low_pass_vec, norm, scale, sub
 from arm_companion.mission.payload import ROTOR_LAG_S, Found, Load, interrupted, watch_load, weigh
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import CARRYING, Anchor, Phase, State
@@ -92,7 +92,7 @@ def _lifted(s: Situation) -> Load:
     # before it is weighed, what the test lift found at least
     little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
     light = state.phase in CARRYING and load.now < little
-    grip = load.grip + s.dt / (_GRIP_S + s.dt) * (tightest - load.grip) if state.phase in CARRYING else 0.0
+    grip = low_pass(load.grip, tightest, s.dt, _GRIP_S) if state.phase in CARRYING else 0.0
     load = replace(load, grip=grip, light_s=load.light_s + s.dt if light else 0.0)
     return weigh(load, s.dt) if state.phase in (Phase.LIFT, Phase.CARRY) and not light else load
 
@@ -135,7 +135,7 @@ def settle(s: Situation) -> State:
     pushed_s = _COMES_ON_S * grasp.mass_min_kg / grasp.mass_max_kg if _comes_on(s) else 0.0
     if s.elapsed >= _steady_s(s) + pushed_s:
         return state
-    rest = add(s.rest, scale(sub(state.position, s.rest), s.dt / (_FOLLOW_S + s.dt)))
+    rest = low_pass_vec(s.rest, state.position, s.dt, _FOLLOW_S)
     return replace(state, rest=rest, anchor=replace(state.anchor, position_w=rest))
 
 

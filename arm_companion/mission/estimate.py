@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Quaternion, TendonState, Vec3, VehicleState
-from arm_companion.mission.motion import add, norm, rotate, scale, sub
+from arm_companion.mission.motion import low_pass_vec, norm, rotate, scale, sub
 from arm_companion.mission.payload import DRAG_PER_S
 from arm_companion.values import replace
 
@@ -139,12 +139,12 @@ def smooth_position(old: Vec3, vehicle: VehicleState, dt: float) -> Vec3:
     new = vehicle.position_w
     if norm(sub(new, old)) > _JUMP_M:
         return new
-    return add(old, scale(sub(new, old), dt / (_POSITION_SMOOTHING_S + dt)))
+    return low_pass_vec(old, new, dt, _POSITION_SMOOTHING_S)
 
 
 def delayed(old: Vec3, push: Vec3, dt: float) -> Vec3:
     """What the observers have felt of a `push` that is known, by their lag."""
-    return add(old, scale(sub(push, old), dt / (OBSERVER_LAG_S + dt)))
+    return low_pass_vec(old, push, dt, OBSERVER_LAG_S)
 
 
 def strength(force: Vec2) -> float:

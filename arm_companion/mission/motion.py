@@ -73,6 +73,16 @@ def ramp(value: float, goal: float, speed: float, dt: float) -> float:
     return goal if abs(change) <= most else value + math.copysign(most, change)
 
 
+def low_pass(old: float, new: float, dt: float, lag_s: float) -> float:
+    """`old` after `dt` seconds of a first-order lag behind `new`; backward Euler, so that no step is too long."""
+    return old + dt / (lag_s + dt) * (new - old)
+
+
+def low_pass_vec(old: Vec3, new: Vec3, dt: float, lag_s: float) -> Vec3:
+    """The same of three numbers."""
+    return add(old, scale(sub(new, old), dt / (lag_s + dt)))
+
+
 def follow(
     reference: Reference,
     goal: Vec3,

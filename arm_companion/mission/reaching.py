@@ -19,7 +19,18 @@ from arm_companion.geometry import so3
 from arm_companion.geometry.arrays import Array
 from arm_companion.mission.facts import Control, Request, Vec3
 from arm_companion.mission.glide import Glide, glide, there
-from arm_companion.mission.motion import ZERO, Reference, add, norm, scale, sub, wrap_angle, yaw_of
+from arm_companion.mission.motion import (
+    ZERO,
+    Reference,
+    add,
+    low_pass,
+    low_pass_vec,
+    norm,
+    scale,
+    sub,
+    wrap_angle,
+    yaw_of,
+)
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import TIP, Phase, Reach, State
 from arm_companion.values import replace
@@ -191,16 +202,16 @@ def _observe(s: Situation, goal: Reach) -> Reach:
     vehicle, dt, prediction = s.facts.vehicle, s.dt, s.state.prediction
     here = add(goal.here_w, scale(vehicle.velocity_w, dt))
     measured = add(vehicle.position_w, scale(vehicle.velocity_w, vehicle.position_age_s))
-    here = add(here, scale(sub(measured, here), dt / (_HERE_S + dt)))
+    here = low_pass_vec(here, measured, dt, _HERE_S)
     sag, error, unknown = goal.sag_a, goal.error_m, goal.unknown_s + dt
     if prediction is not None and math.isfinite(prediction.tip_a[0]):
         length = s.parameters.model.parameters.L
         now = sub(prediction.tip_a, _vec3(arc.tip_position(prediction.bend, length)))
-        sag = add(sag, scale(sub(now, sag), dt / (_SAG_S + dt)))
+        sag = low_pass_vec(sag, now, dt, _SAG_S)
         tip_a = arc.tip_position(s.bend, length) + sag
         tip = here + so3.from_quaternion(vehicle.attitude_wb) @ (s.mount.position + s.mount.rotation @ tip_a)
         away, unknown = math.dist(tip, goal.target_w), 0.0
-        error = away if math.isinf(error) else error + dt / (_ERROR_S + dt) * (away - error)
+        error = away if math.isinf(error) else low_pass(error, away, dt, _ERROR_S)
     if unknown > _UNKNOWN_S:
         error = math.inf
     there_now = not unknown and error <= s.config.reach.tolerance_m and settled(goal)

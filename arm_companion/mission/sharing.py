@@ -8,7 +8,7 @@ carries it. docs/adr/0018 says why neither a lowered position nor a disarm is us
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, norm, ramp, scale, sub
+from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, low_pass_vec, norm, ramp, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Sharing, State
 from arm_companion.values import replace
@@ -74,7 +74,7 @@ def keep_sharing(s: Situation) -> Sharing:
     rests = load.share == load.step and norm(away) < hang.rest_m
     return replace(
         load,
-        place=add(load.place, scale(away, s.dt / (_PLACE_S + s.dt))),
+        place=low_pass_vec(load.place, s.state.position, s.dt, _PLACE_S),
         rested_s=load.rested_s + s.dt if rests else 0.0,
         carried_s=load.carried_s + s.dt if _motors_carry(s) else 0.0,
     )

@@ -4,7 +4,7 @@ import math
 
 from arm_companion.mission.facts import TendonState, Vec3
 from arm_companion.mission.gripper_facts import JawState
-from arm_companion.mission.motion import ZERO, add, norm, scale, sub
+from arm_companion.mission.motion import ZERO, add, low_pass, norm, scale, sub
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import FOLLOWS, State
 from arm_companion.values import replace
@@ -92,9 +92,10 @@ def _rests(s: Situation) -> bool:
 
 
 def _rocking(s: Situation, before: float) -> float:
+    """Mean square of the rates of roll and pitch; what is old or no number leaves it as it was."""
     roll, pitch, _ = s.facts.vehicle.rate_b
     now = roll * roll + pitch * pitch
-    return before + s.dt / (_ROCKING_S + s.dt) * (now - before) if s.vehicle_fresh and math.isfinite(now) else before
+    return low_pass(before, now, s.dt, _ROCKING_S) if s.vehicle_fresh and math.isfinite(now) else before
 
 
 def _blind(s: Situation) -> bool:

@@ -12,6 +12,8 @@ from arm_companion.mission.motion import (
     add,
     arrived,
     follow,
+    low_pass,
+    low_pass_vec,
     norm,
     rotate,
     scale,
@@ -110,3 +112,13 @@ def test_heading_of_a_level_attitude(yaw: float) -> None:
     q = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
     assert abs(wrap_angle(yaw_of(q) - yaw)) < 1e-9
     assert rotate(q, (1.0, 0.0, 0.0)) == pytest.approx((math.cos(yaw), math.sin(yaw), 0.0), abs=1e-9)
+
+
+@given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3), st.floats(1e-3, 10.0), st.floats(1e-2, 10.0))
+def test_a_low_pass_goes_towards_the_new_value_and_never_past_it(
+    old: float, new: float, dt: float, lag_s: float
+) -> None:
+    after = low_pass(old, new, dt, lag_s)
+    assert min(old, new) - 1e-9 <= after <= max(old, new) + 1e-9
+    assert abs(new - after) <= abs(new - old) * lag_s / (lag_s + dt) + 1e-9
+    assert low_pass_vec((old, new, 0.0), (new, old, 0.0), dt, lag_s) == (after, low_pass(new, old, dt, lag_s), 0.0)
