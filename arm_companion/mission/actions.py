@@ -167,7 +167,7 @@ def act(s: Situation) -> tuple[State, ArmAction, tuple[float, ...] | None]:
         state = replace(state, bend_goal=state.bend)
     elif _loose(s):
         state = replace(state, bend_goal=_tighter(s))
-    speed = 0.0 if _ahead_of_the_others(s) else s.config.perch.bend_speed_rad_per_s
+    speed = 0.0 if _ahead_of_the_others(s) or beside.waits(s) else s.config.perch.bend_speed_rad_per_s
     bend = _bend_towards(state.bend, state.bend_goal, speed * s.stride)
     if not s.parameters.admits(state.bend, bend):
         bend = state.bend

@@ -2,9 +2,11 @@
 
 import math
 
+import numpy as np
+
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, add, dot, scale, sub
+from arm_companion.mission.motion import ZERO, add, dot, rotate, scale, sub
 from arm_companion.mission.situation import Situation, at
 from arm_companion.mission.state import PerchKind, Phase
 
@@ -14,6 +16,7 @@ _RESTLESS_S = 8.0
 _AT_BAR_M = 0.03
 _NEARER_M = 0.01
 _ASIDE_M = 0.01
+_REACHES_SHARE = (0.36, 0.4)  # of the wrap: the arm touches from 0.43 on
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 
 
@@ -69,9 +72,8 @@ def settled(s: Situation) -> str | None:
     # The blow of the bar throws it back and forth: one that passes by on its way does not rest, one in wind never will.
     # Nearer to the bar than it should be it waits on: the curl would meet the bar before it closes. Aside of the middle
     # of an object it does, too: what is heavy, and held there, leans the vehicle, and meets its place with one end.
-    off = sub(s.facts.vehicle.position_w, reference.position)
-    nearer = dot(off, s.ahead)
-    if s.grasping and abs(off[0] * s.ahead[1] - off[1] * s.ahead[0]) > _ASIDE_M:
+    nearer = dot(sub(s.facts.vehicle.position_w, reference.position), s.ahead)
+    if s.grasping and aside(s) > _ASIDE_M:
         return None
     near = s.elapsed > _RESTLESS_S and nearer <= _NEARER_M and at(s, reference.position, _AT_BAR_M)
     return "settled clear of the bar" if near or s.state.vigil.rested_s >= _RESTED_S else None
@@ -80,3 +82,26 @@ def settled(s: Situation) -> str | None:
 def settled_at_object(s: Situation) -> str | None:
     """The same of an object that is to be grasped."""
     return settled(s) if s.grasping else None
+
+
+def aside(s: Situation) -> float:
+    """How far beside the middle of bar or object, as it was told, the straight arm meets it, m, unsigned.
+
+    Wind leans the vehicle, and an arm that is straight points aside with it, by half a centimetre for 1.5 degrees.
+    """
+    reach = s.mount.position + s.mount.rotation @ np.array((0.0, 0.0, s.config.perch.contact_arc_m))
+    vehicle = s.facts.vehicle
+    meets = add(vehicle.position_w, rotate(vehicle.attitude_wb, (float(reach[0]), float(reach[1]), float(reach[2]))))
+    x, y, _ = sub(meets, s.bar.point_w)
+    return abs(x * s.ahead[1] - y * s.ahead[0])
+
+
+def waits(s: Situation) -> bool:
+    """Whether a curl that is about to reach its object waits, for a vehicle that has been carried off aside of it.
+
+    From there on the arm holds the vehicle where it is: what is heavy, and held beside its middle, hangs askew.
+    """
+    if s.state.phase is not Phase.CLOSE or s.gripping:
+        return False
+    share = math.hypot(*s.state.bend) / s.config.perch.wrap_bend_rad
+    return _REACHES_SHARE[0] <= share < _REACHES_SHARE[1] and aside(s) > _ASIDE_M

@@ -44,6 +44,9 @@ _ROSE_M = 0.008  # beyond what an estimate wanders by meanwhile
 _CATCH_UP = 4.0  # 1/s
 _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it has lost what it held
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
+_GONE_SHARE = 0.35  # the same where it may have met something; less would find a lost one too late
+_PROPPED_SHARE = 0.85  # of the load, under which something else carries part of it; weighing errs by 6 %
+_AGAIN_M = 0.1  # at least
 _GRIP_S = 1.0
 _GRIP_SIGMA = (0.015, 0.03, 0.015)  # m, base axes: along the bend, along the object's axis, along the arm
 
@@ -87,13 +90,22 @@ def _lifted(s: Situation) -> Load:
     tightest = max(s.tensions, default=0.0)
     loose = gripper.is_shut(s) if s.gripping else tightest < _LOOSE_SHARE * load.grip
     share = _LOOSE_LIGHT_SHARE if loose else LIGHT_SHARE
-    if s.gripping and state.phase is Phase.PLACE and low(s):
-        share = _TOUCHING_SHARE  # what touches down is let go before the vehicle sways about it
+    if state.phase is Phase.PLACE:
+        if s.gripping and low(s):
+            share = _TOUCHING_SHARE  # what touches down is let go before the vehicle sways about it
+        elif not (s.gripping or low(s)):
+            share = LIGHT_SHARE if loose else _GONE_SHARE  # what meets something on its way down is not lost
     # before it is weighed, what the test lift found at least
     little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
     light = state.phase in CARRYING and load.now < little
+    propped = state.phase is Phase.PLACE and load.known and little <= load.now < _PROPPED_SHARE * load.mass
     grip = low_pass(load.grip, tightest, s.dt, _GRIP_S) if state.phase in CARRYING else 0.0
-    load = replace(load, grip=grip, light_s=load.light_s + s.dt if light else 0.0)
+    load = replace(
+        load,
+        grip=grip,
+        light_s=load.light_s + s.dt if light else 0.0,
+        propped_s=load.propped_s + s.dt if propped else 0.0,
+    )
     return weigh(load, s.dt) if state.phase in (Phase.LIFT, Phase.CARRY) and not light else load
 
 
@@ -112,8 +124,8 @@ def prepare(s: Situation) -> State:
             reference = None if state.reference is None else replace(state.reference, position=place)
             return replace(state, anchor=anchor, rest=place, offset=test, bend_goal=state.bend, reference=reference)
         case Phase.LIFT:  # what the object weighs is found anew
-            load = replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0)
-            return replace(state, offset=ZERO, load=load)
+            load = replace(state.load, mass=0.0, weighed_s=0.0, light_s=0.0, propped_s=0.0)
+            return replace(state, offset=sub(_up(s), s.probe), load=load)
         case Phase.PLACE:
             return replace(state, way_m=_way_down(s))
         case Phase.RELEASE if state.anchor is not None:  # of a closed arm, wherever that is: out as it came in
@@ -150,7 +162,7 @@ def goal(s: Situation) -> tuple[Vec3, float]:
             return (x, y, min(z, s.state.position[2])), grasp.lift_speed_m_per_s
         return add(s.rest, s.state.offset), _test_speed(s)
     if s.state.phase is Phase.LIFT:
-        return add(s.probe, (0.0, 0.0, -grasp.lift_height_m)), grasp.lift_speed_m_per_s
+        return add(s.probe, s.state.offset), grasp.lift_speed_m_per_s
     if s.state.feedforward and s.state.reference is not None and _touching_down(s):
         return s.state.reference.position, grasp.lift_speed_m_per_s
     down, here = s.setting_down, s.facts.vehicle.position_w
@@ -160,6 +172,13 @@ def goal(s: Situation) -> tuple[Vec3, float]:
         )
     share = _SLOWLY if s.probe[2] - here[2] < _NEAR_GROUND_M else 1.0
     return down, share * grasp.lift_speed_m_per_s
+
+
+def _up(s: Situation) -> Vec3:
+    """Vehicle position to lift to: above where the object was taken; lifted again, above what it met as well."""
+    x, y, _ = s.setting_down
+    z = s.probe[2] - s.config.grasp.lift_height_m
+    return x, y, min(z, s.facts.vehicle.position_w[2] - _AGAIN_M) if s.state.load.propped_s else z
 
 
 def _test_speed(s: Situation) -> float:

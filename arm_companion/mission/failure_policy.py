@@ -172,6 +172,18 @@ CAUSES: tuple[Cause, ...] = (
     ),
     Cause("nothing below to set a load down on", ArmFault.NO_CONTACT, (grasp.nothing_below,), "does not apply"),
     Cause(
+        "load meets something high above its place",
+        ArmFault.GRIP_TEST_FAILED,
+        (grasp.met_early,),
+        "does not apply; whoever sets down by hand knows where",
+    ),
+    Cause(
+        "arm closes beside the middle of its object",
+        ArmFault.GRIP_TEST_FAILED,
+        (grasp.held_aside,),
+        "not judged: an object is judged as it is closed around, a bar has no middle",
+    ),
+    Cause(
         "gripper does not open",
         ArmFault.GRIP_TEST_FAILED,
         (gripper.does_not_open,),

@@ -6,7 +6,7 @@ when the rotors say that the load is off; or from HOLDING, when a person says so
 
 import math
 
-from arm_companion.mission import gripper
+from arm_companion.mission import beside, gripper
 from arm_companion.mission.facts import ArmFault, Order
 from arm_companion.mission.hazards import (
     astray,
@@ -34,6 +34,9 @@ _DROPPED_S = 0.1
 _SET_DOWN_S = 0.4
 _AT_GROUND_M = 0.05
 _LOWEST_M = 0.02
+_HELD_ASIDE_M = 0.015
+_EARLY_M = 0.07  # an end that hangs 25 degrees low meets its cradle 5 cm early, and lies down as the arm goes on
+_PROPPED_S = 0.2
 _RISEN_SHARE = 0.6
 _SETTLE_S = 1.0
 _JUDGED_S = 6.0
@@ -77,6 +80,16 @@ def not_closed(s: Situation) -> str | None:
     return f"closed around nothing: {max(s.state.tension):.1f} N, {s.config.grasp.grip_tension_n:g} N are needed"
 
 
+def held_aside(s: Situation) -> str | None:
+    """The arm has closed, but beside the middle of its object: gusts and the blow of the arm carry a vehicle off.
+
+    A heavy one would hang by it like a scale out of balance: 300 g held 3 cm aside hang 45 degrees askew.
+    """
+    if s.gripping or closed(s) is None or (aside := beside.aside(s)) <= _HELD_ASIDE_M:
+        return None
+    return f"closed {aside * 100:.1f} cm beside the middle"
+
+
 def lift_failed(s: Situation) -> str | None:
     """The test lift went up with nothing, or pulled more than may be lifted."""
     load, grasp = s.state.load, s.config.grasp
@@ -101,6 +114,20 @@ def nothing_below(s: Situation) -> str | None:
         return None
     as_low = abs(reference.position[2] - s.facts.vehicle.position_w[2]) <= _LOWEST_M
     return "nothing found to set the load down on" if as_low and arrived(reference, s.setting_down) else None
+
+
+def met_early(s: Situation) -> str | None:
+    """Something carries part of the load, well above where it was taken: it hangs askew, or not above its place.
+
+    Going on would turn it out of the arm, or push it off what it met. A pilot who sets down by hand knows where.
+    """
+    load, above = s.state.load, s.probe[2] - s.state.position[2]
+    if not s.external or load.propped_s < _PROPPED_S or above < _EARLY_M:
+        return None
+    return (
+        f"the load met something {above * 100:.0f} cm above where it was taken: "
+        f"{load.now:.2f} of {load.mass:.2f} kg are left on the arm"
+    )
 
 
 def takes_too_long(s: Situation) -> str | None:
@@ -223,12 +250,14 @@ ABORTS: tuple[Row, ...] = (
 
 PROGRESS: tuple[Row, ...] = (
     Row(frozenset({Phase.REACH}), gripper.at_object, Phase.CONTACT, "object between the jaws"),
+    *or_fail(Phase.CLOSE, held_aside, Phase.UNLOAD, "held aside", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.CLOSE}), closed, Phase.VERIFY, "closed"),
     *or_fail(Phase.CLOSE, not_closed, Phase.UNLOAD, "not closed", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.VERIFY}), lift_failed, Phase.UNLOAD, "test lift failed", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.VERIFY}), lift_passed, Phase.LIFT, "test lift passed"),
     Row(frozenset({Phase.LIFT}), lifted, Phase.CARRY, "lifted"),
     Row(frozenset({Phase.PLACE}), set_down, Phase.RELEASE, "load is off"),
+    Row(frozenset({Phase.PLACE}), met_early, Phase.LIFT, "met something early", ArmFault.GRIP_TEST_FAILED),
     Row(frozenset({Phase.PLACE}), nothing_below, Phase.CARRY, "nothing below", ArmFault.NO_CONTACT),
 )
 

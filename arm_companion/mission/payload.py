@@ -198,6 +198,7 @@ class Load:
         weighed_s: length of that mean, s.
         grip: tension of the tightest tendon while carrying, N, smoothed.
         light_s: how long `now` has been too little for the mean.
+        propped_s: how long something else has carried part of it.
         found: what the test lift finds at this moment; None: it cannot be told, or there is no test lift.
         found_s: how long it has found just that.
         grounded: the vehicle has been seen to stand, and has not climbed since.
@@ -213,6 +214,7 @@ class Load:
     weighed_s: float = 0.0
     grip: float = 0.0
     light_s: float = 0.0
+    propped_s: float = 0.0
     found: Found | None = None
     found_s: float = 0.0
     grounded: bool = False
@@ -296,7 +298,7 @@ def watch_load(
 
 def interrupted(old: Load) -> Load:
     """The load when nothing can be told of this moment."""
-    return replace(old, flow=None, seen_s=0.0, light_s=0.0, now=math.nan)
+    return replace(old, flow=None, seen_s=0.0, light_s=0.0, propped_s=0.0, now=math.nan)
 
 
 def weigh(old: Load, dt: float) -> Load:

@@ -155,6 +155,15 @@ def _slack(facts: Facts) -> Facts:
     return dataclasses.replace(facts, tendons=tuple(dataclasses.replace(t, tension_sigma=0.05) for t in found))
 
 
+def _propped(state: State) -> State:
+    """Half of the load is carried by something 30 cm above where it was taken."""
+    x, y, z = PLACE
+    here = (x, y, z - 0.3)
+    half = weighed(dataclasses.replace(state, position=here, reference=Reference(here)), 0.4)
+    lighter = ThrustCurve.prior(0.45)  # at the thrust of the facts these rotors lift a load
+    return dataclasses.replace(half, load=dataclasses.replace(half.load, curve=lighter, flow=None))
+
+
 _WRENCH = WrenchReport((13.0, 0, 0), (0, 0, 0), (1, 1, 1), (1, 1, 1), WrenchSource.ANCHORED, True, 1.0, 0.0)
 _SUSPECT = TendonWatch()
 
@@ -198,6 +207,14 @@ PROVOCATIONS: dict[str, Provocation] = {
         seconds=0.15,
     ),
     "nothing below to set a load down on": Provocation("nothing found", moved((0.0, 0.0, DEEP)), _at_the_bottom),
+    "load meets something high above its place": Provocation(
+        "met something", moved((0.0, 0.0, -0.3)), _propped, seconds=0.3
+    ),
+    "arm closes beside the middle of its object": Provocation(
+        "beside the middle",
+        lambda facts: moved((0.0, 0.02, 0.0))(tendon(0, tension=30.0)(facts)),
+        _remember(tension=(30.0, 4.0, 1.0, 4.0)),
+    ),
     "slip": Provocation("grip lost|slip", moved((-0.2, 0.0, 0.2))),
     "no contact in time": Provocation("without contact", recall=_remember(since=T0 - 45.0)),
     "bar or object told elsewhere": Provocation(

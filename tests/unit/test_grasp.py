@@ -187,6 +187,44 @@ def asked(run: Run) -> tuple[Vec3, Vec3]:
     return said.position_w, said.acceleration_w
 
 
+def beside_middle(metres: float, parameters: Parameters, facts: Facts) -> Facts:
+    """Facts in which the vehicle hovers `metres` aside of where it takes the object by its middle, facing +x."""
+    x, y, z = Situation(memory(Phase.CLOSE), facts, T0, parameters).place(0.0)
+    return vehicle(position_w=(x, y + metres, z))(facts)
+
+
+def test_a_curl_waits_for_a_vehicle_that_was_carried_off_just_before_it_would_hold_it_there(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    wrap = parameters.config.perch.wrap_bend_rad
+
+    def bent_by(share: float, aside: float) -> float:
+        begun = share * wrap
+        reference = Reference(beside_middle(aside, parameters, hovering()).vehicle.position_w)
+        state = memory(Phase.CLOSE, bend=(begun, 0.0), bend_goal=(wrap, 0.0), reference=reference)
+        run = Run(state, parameters)
+        run.cycles(beside_middle(aside, parameters, hovering((begun, 0.0))), 0.1)
+        return run.state.bend[0] - begun
+
+    assert bent_by(0.2, 0.03) > 0.0, "far from the object there is time"
+    assert bent_by(0.37, 0.03) == 0.0
+    assert bent_by(0.37, -0.03) == 0.0
+    assert bent_by(0.37, 0.005) > 0.0
+    assert bent_by(0.6, 0.03) > 0.0, "around the object the arm holds the vehicle where it is"
+
+
+@pytest.mark.parametrize(("aside", "follows"), [(0.005, Phase.VERIFY), (0.02, Phase.UNLOAD), (-0.02, Phase.UNLOAD)])
+def test_what_is_held_beside_its_middle_is_let_go_before_it_is_lifted(
+    aside: float, follows: Phase, parameters: Parameters, hovering: Hovering
+) -> None:
+    wrap = parameters.config.perch.wrap_bend_rad
+    held = memory(Phase.CLOSE, bend=(wrap, 0.0), bend_goal=(wrap, 0.0), tension=(30.0, 4.0, 1.0, 4.0))
+    run = Run(held, parameters)
+    run.cycle(tendon(0, tension=30.0)(beside_middle(aside, parameters, hovering((wrap, 0.0)))))
+    assert run.phases == [Phase.CLOSE, follows]
+    assert any("closed 2.0 cm beside the middle" in text for text in run.texts) == (follows is Phase.UNLOAD)
+
+
 def test_an_arm_that_closes_around_nothing_goes_back(parameters: Parameters, hovering: Hovering) -> None:
     wrap = parameters.config.perch.wrap_bend_rad
     run = Run(memory(Phase.CLOSE, since=T0 - 10.0, bend=(wrap, 0.0), bend_goal=(wrap, 0.0)), parameters)
@@ -388,10 +426,11 @@ def test_a_pilot_who_sets_the_load_down_by_hand_is_followed_by_the_arm(
     assert all(said.setpoint is None for said in run.said)
 
 
+@pytest.mark.parametrize("phase", [Phase.CARRY, Phase.PLACE])
 def test_a_load_that_is_lost_is_told_within_three_tenths_of_a_second_and_the_arm_stays_as_it_is(
-    parameters: Parameters, hovering: Hovering
+    phase: Phase, parameters: Parameters, hovering: Hovering
 ) -> None:
-    run = Run(carrying(Phase.CARRY), parameters)
+    run = Run(carrying(phase), parameters)
     run.cycles(aloft(hovering), 1.0)
     up = MASS * 9.80665 / 1.8  # the thrust stays, the weight is gone
     for i in range(30):
@@ -399,7 +438,7 @@ def test_a_load_that_is_lost_is_told_within_three_tenths_of_a_second_and_the_arm
         run.cycle(falling)
         if run.state.phase is Phase.HOLDING:
             break
-    assert run.phases == [Phase.CARRY, Phase.HOLDING]
+    assert run.phases == [phase, Phase.HOLDING]
     assert run.state.errors & ArmFault.CONTACT_LOST
     assert any("load lost: 0.20 kg" in text for text in run.texts)
     assert norm(run.state.lean) == 0.0
@@ -453,6 +492,46 @@ def test_a_load_that_swings_beside_what_it_lay_on_is_kept(parameters: Parameters
     assert run.phases[:2] == [Phase.PLACE, Phase.CARRY]
     assert any("nothing found to set the load down on" in text for text in run.texts)
     assert not opened(run.said)
+
+
+def test_a_load_that_meets_something_high_above_its_place_is_lifted_again_and_kept(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    """An end of what hangs askew: the arm would turn it out of its hold by going on."""
+    run = Run(carrying(Phase.PLACE, up=0.15), parameters)
+    run.cycles(aloft(hovering, 0.6 * MASS, 0.15), 0.5)
+    assert run.phases == [Phase.PLACE, Phase.LIFT]
+    assert any("met something 15 cm above where it was taken: 0.1" in text for text in run.texts)
+    assert run.state.errors & ArmFault.GRIP_TEST_FAILED
+    for i in range(800):
+        run.cycle(aloft(hovering, MASS, 0.15 + 0.25 * min(i / 400.0, 1.0)))
+    place, _ = asked(run)
+    assert place == pytest.approx((PLACE[0], PLACE[1], PLACE[2] - HEIGHT))
+    assert run.phases == [Phase.PLACE, Phase.LIFT, Phase.CARRY]
+    assert not opened(run.said)
+
+
+def test_lifted_again_elsewhere_it_stays_there_and_never_goes_down(parameters: Parameters, hovering: Hovering) -> None:
+    """A table, two metres away and half a metre higher than what the object lay on."""
+    x, y, z = PLACE
+    here = (x + 2.0, y, z - 0.5)
+    run = Run(carrying(Phase.PLACE, position=here, reference=Reference(here)), parameters)
+    run.cycles(moved((2.0, 0.0, 0.0))(aloft(hovering, 0.6 * MASS, 0.5)), 0.5)
+    assert run.phases == [Phase.PLACE, Phase.LIFT]
+    for _ in range(400):
+        run.cycle(vehicle(position_w=asked(run)[0])(aloft(hovering)))
+    (there_x, there_y, there_z), _ = asked(run)
+    assert (there_x, there_y) == pytest.approx((x + 2.0, y), abs=1e-3)
+    assert z - 0.7 < there_z < z - 0.55
+
+
+@pytest.mark.parametrize(("share", "up"), [(0.6, 0.06), (0.95, 0.15)])
+def test_what_touches_near_its_place_or_only_swings_is_set_down(
+    share: float, up: float, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.PLACE, up=up), parameters)
+    run.cycles(aloft(hovering, share * MASS, up), 1.0)
+    assert run.phases == [Phase.PLACE]
 
 
 @pytest.mark.parametrize("up", [0.4, 6.0])
