@@ -16,7 +16,8 @@ _RESTLESS_S = 8.0
 _AT_BAR_M = 0.03
 _NEARER_M = 0.01
 _ASIDE_M = 0.01
-_REACHES_SHARE = (0.36, 0.4)  # of the wrap: the arm touches from 0.43 on
+_FREE_SHARE = 0.4  # of the wrap, up to which the arm is clear of what it curls around: it touches from 0.43 on
+_WAITS_SHARE = 0.36
 _FORWARD_SHARE = 0.7  # of the wrap, by which the vehicle has made up the clearance
 
 
@@ -96,12 +97,15 @@ def aside(s: Situation) -> float:
     return abs(x * s.ahead[1] - y * s.ahead[0])
 
 
+def is_free(s: Situation) -> bool:
+    """Whether a curl has yet to reach what it closes around."""
+    return math.hypot(*s.state.bend) < _FREE_SHARE * s.config.perch.wrap_bend_rad
+
+
 def waits(s: Situation) -> bool:
     """Whether a curl that is about to reach its object waits, for a vehicle that has been carried off aside of it.
 
     From there on the arm holds the vehicle where it is: what is heavy, and held beside its middle, hangs askew.
     """
-    if s.state.phase is not Phase.CLOSE or s.gripping:
-        return False
-    share = math.hypot(*s.state.bend) / s.config.perch.wrap_bend_rad
-    return _REACHES_SHARE[0] <= share < _REACHES_SHARE[1] and aside(s) > _ASIDE_M
+    near = math.hypot(*s.state.bend) >= _WAITS_SHARE * s.config.perch.wrap_bend_rad
+    return s.state.phase is Phase.CLOSE and not s.gripping and near and is_free(s) and aside(s) > _ASIDE_M

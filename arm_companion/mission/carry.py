@@ -6,7 +6,7 @@ import numpy as np
 
 from arm_companion.arm.model import Payload
 from arm_companion.arm.reaction import GRAVITY
-from arm_companion.mission import gripper
+from arm_companion.mission import beside, gripper
 from arm_companion.mission.facts import PayloadReport, Vec3
 from arm_companion.mission.grasp import LIGHT_SHARE, low
 from arm_companion.mission.motion import ZERO, add, low_pass, low_pass_vec, norm, scale, sub
@@ -30,7 +30,7 @@ _UNTOUCHED = frozenset(
 """Phases in which the rotors lift the vehicle alone."""
 
 _ARDUPILOT_LAG_S = 0.08  # of the 2 Hz low-pass between the thrust that ArduPilot tells and its motors
-_OPEN_SHARE = 0.5  # of the wrap, up to which the arm is still clear of the object
+_COMES_OFF_S = 1.5  # until the vehicle that goes back from the touch has taken the arm away
 _NEAR_GROUND_M = 0.1
 _SLOWLY = 0.3  # share of the speed there
 _ABOVE_M = 0.03
@@ -77,36 +77,56 @@ def _lifted(s: Situation) -> Load:
     state = s.state
     if not s.vehicle_fresh:
         return interrupted(state.load)
-    share = math.hypot(*state.bend) / s.config.perch.wrap_bend_rad
-    lifted: float | None = None
-    if s.gripping and state.phase in (Phase.CONTACT, Phase.CLOSE):
-        lifted = None  # the tip may stand on the object
-    elif state.phase in _UNTOUCHED or (state.phase is Phase.CLOSE and share < _OPEN_SHARE):
-        lifted = 0.0
-    elif state.phase is Phase.CARRY and state.load.settled and not state.load.light_s:
-        lifted = state.load.mass  # whatever the rotors need more from now on is the battery's fault
     lag = ROTOR_LAG_S + (_ARDUPILOT_LAG_S if s.config.vehicle.autopilot == "ardupilot" else 0.0)
-    load = watch_load(state.load, s.facts.vehicle, s.config.vehicle.mass_kg, s.dt, lifted=lifted, lag_s=lag)
-    tightest = max(s.tensions, default=0.0)
-    loose = gripper.is_shut(s) if s.gripping else tightest < _LOOSE_SHARE * load.grip
-    share = _LOOSE_LIGHT_SHARE if loose else LIGHT_SHARE
-    if state.phase is Phase.PLACE:
-        if s.gripping and low(s):
-            share = _TOUCHING_SHARE  # what touches down is let go before the vehicle sways about it
-        elif not (s.gripping or low(s)):
-            share = LIGHT_SHARE if loose else _GONE_SHARE  # what meets something on its way down is not lost
+    mass, lifted = s.config.vehicle.mass_kg, _surely_lifted(s)
+    load = watch_load(state.load, s.facts.vehicle, mass, s.dt, lifted=lifted, lag_s=lag)
+    if state.phase not in CARRYING:
+        return replace(load, grip=0.0, light_s=0.0, propped_s=0.0)
     # before it is weighed, what the test lift found at least
-    little = share * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
-    light = state.phase in CARRYING and load.now < little
+    little = _gone_share(s) * load.mass if load.known else LIGHT_SHARE * s.config.grasp.mass_min_kg
+    light = load.now < little
     propped = state.phase is Phase.PLACE and load.known and little <= load.now < _PROPPED_SHARE * load.mass
-    grip = low_pass(load.grip, tightest, s.dt, _GRIP_S) if state.phase in CARRYING else 0.0
     load = replace(
         load,
-        grip=grip,
+        grip=low_pass(load.grip, max(s.tensions, default=0.0), s.dt, _GRIP_S),
         light_s=load.light_s + s.dt if light else 0.0,
         propped_s=load.propped_s + s.dt if propped else 0.0,
     )
-    return weigh(load, s.dt) if state.phase in (Phase.LIFT, Phase.CARRY) and not light else load
+    return weigh(load, s.dt) if state.phase is not Phase.PLACE and not light else load
+
+
+def _surely_lifted(s: Situation) -> float | None:
+    """What the rotors lift besides the vehicle, kg, so that they may be learnt from; None: nobody knows."""
+    state = s.state
+    if s.gripping and state.phase in (Phase.CONTACT, Phase.CLOSE):
+        return None  # the tip may stand on the object
+    if state.phase in _UNTOUCHED:
+        return None if _just_met(s) else 0.0
+    if state.phase is Phase.CLOSE and beside.is_free(s):
+        return 0.0
+    if state.phase is Phase.CARRY and state.load.settled and not state.load.light_s:
+        return state.load.mass  # whatever the rotors need more from now on is the battery's fault
+    return None
+
+
+def _gone_share(s: Situation) -> float:
+    """Of a load that is known, under which it counts as off the arm."""
+    placing = s.state.phase is Phase.PLACE
+    if s.gripping:
+        if placing and low(s):
+            return _TOUCHING_SHARE  # what touches down is let go before the vehicle sways about it
+        return _LOOSE_LIGHT_SHARE if gripper.is_shut(s) else LIGHT_SHARE
+    loose = max(s.tensions, default=0.0) < _LOOSE_SHARE * s.state.load.grip
+    if placing and not low(s):
+        return LIGHT_SHARE if loose else _GONE_SHARE  # what meets something on its way down is not lost
+    return _LOOSE_LIGHT_SHARE if loose else LIGHT_SHARE
+
+
+def _just_met(s: Situation) -> bool:
+    """Whether the arm may still lie against what it met, which carries a tenth of a newton and more of it."""
+    if s.state.phase is Phase.REACH:
+        return s.state.force.above_s > 0.0
+    return s.state.phase is Phase.CONTACT and s.elapsed < _COMES_OFF_S
 
 
 def prepare(s: Situation) -> State:

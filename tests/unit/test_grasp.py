@@ -10,6 +10,7 @@ import pytest
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.beside import touching
+from arm_companion.mission.estimate import ForceObserver
 from arm_companion.mission.facts import (
     ArmFault,
     Commands,
@@ -95,6 +96,29 @@ def test_the_push_that_holds_a_load_up_counts_the_rotors_curve_where_the_autopil
     assert curve is not None
     assert curve.gain > 1.1
     assert run.state.lean[2] == pytest.approx(straight / curve.gain if curved else straight, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("phase", "above_s", "seconds", "learns"),
+    [
+        (Phase.REACH, 0.0, 0.3, True),
+        (Phase.REACH, 0.05, 0.01, False),  # one cycle: then it has met something
+        (Phase.CONTACT, 0.0, 1.0, False),
+        (Phase.CONTACT, 0.0, 3.0, True),
+    ],
+)
+def test_the_rotors_are_not_learnt_from_while_the_arm_may_lie_against_what_it_met(
+    phase: Phase, above_s: float, seconds: float, *, learns: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """It carries a tenth of a newton or two, which the battery's fall would be taken for."""
+    force = ForceObserver(tared_s=2.0, force=(-9.0, 0.0), velocity=(0.0, 0.0), above_s=above_s)
+    state = hovered(phase, since=T0 - 0.01, force=force if above_s else ForceObserver())
+    run = Run(state, parameters)
+    run.cycles(vehicle(thrust=HOVER - 0.01)(hovering()), seconds)
+    assert state.load.curve is not None
+    assert run.state.load.curve is not None
+    learnt = run.state.load.curve.theta[0] - state.load.curve.theta[0]
+    assert (learnt > 0.0) == learns, "less thrust hovers: stronger rotors, or something else carries"
 
 
 # --- setting out ---
