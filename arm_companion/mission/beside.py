@@ -52,12 +52,16 @@ def curling(s: Situation) -> Vec3:
     share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
     closed = add(s.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
-        closed = s.rest if state.kind is PerchKind.HANG else state.anchor.position_w
+        closed = s.rest
     # forward first, while the curl is still wide; and away from the bar before anything can hook into it
-    leaves = state.phase is Phase.RELEASE and not s.grasping and state.kind is PerchKind.ANCHOR
-    forward = 1.0 if leaves else _FORWARD_SHARE
+    forward = 1.0 if leaves(s) else _FORWARD_SHARE
     ahead = scale(s.ahead, -perch.wrap_clearance_m * max(1.0 - share / forward, 0.0))
     return add(add(s.contact_w, scale(sub(closed, s.contact_w), share)), ahead)
+
+
+def leaves(s: Situation) -> bool:
+    """Whether an arm below opens, and its vehicle makes away from the bar meanwhile."""
+    return s.state.phase is Phase.RELEASE and not s.grasping and s.state.kind is PerchKind.ANCHOR
 
 
 def clear(s: Situation) -> Vec3:

@@ -128,6 +128,31 @@ def test_the_way_out_of_a_wrap_begins_no_lower_than_easing_ended(parameters: Par
     assert run.state.reference.position[2] > far.position[2] + 0.1, "not for what it has drifted"
 
 
+@pytest.mark.parametrize(
+    ("fields", "told"), [({}, True), ({"task": Order.GRASP}, False), ({"kind": PerchKind.HANG}, False)]
+)
+def test_a_vehicle_that_leaves_its_bar_is_told_how_fast_it_rises_and_from_where_it_rests(
+    fields: dict[str, object], told: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """The bar carried some of the arm, and without it the vehicle sinks, and its mount onto the bar."""
+    here = (PLACE[0] - 0.01, PLACE[1], PLACE[2])  # the estimate has drifted by a centimetre since the grip
+    wrapped = (parameters.config.perch.wrap_bend_rad, 0.0)
+    state = memory(Phase.RELEASE, reference=Reference(here), rest=here, bend=wrapped, contact_w=(1.96, 0.0, -2.26))
+    run = Run(dataclasses.replace(state, **fields), parameters)  # type: ignore[arg-type]
+    before = run.state.reference
+    for _ in range(100):
+        run.cycle(hovering(run.state.bend))
+        after = run.state.reference
+        assert before is not None
+        assert after is not None
+        rise = (after.position[2] - before.position[2]) / 0.01 if told else 0.0
+        assert after.velocity == pytest.approx((0.0, 0.0, rise), abs=1e-9)
+        if told:
+            assert abs(after.position[0] - before.position[0]) < 1e-3, "no jump back to where it gripped"
+        before = after
+    assert not told or rise < -0.005
+
+
 def test_a_pilot_who_took_over_meanwhile_does_not_wait_for_a_place(parameters: Parameters, hovering: Hovering) -> None:
     load = known(-1.2, parameters.config)
     run = Run(unloading(load, control=Control.PILOT, reference=None), parameters)
