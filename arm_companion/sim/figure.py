@@ -73,7 +73,7 @@ def _draw_position(axis: Axes, flight: Flight, config: Config, start: float) -> 
     axis.axhline(x, color=_X, lw=0.8, ls=":")
     axis.axhline(-z, color=_Z, lw=0.8, ls=":")
     axis.set_ylabel("vehicle, m\n(dotted: bar or object)")
-    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
 def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
@@ -94,7 +94,7 @@ def _draw_moves(axis: Axes, flight: Flight, start: float) -> None:
         for asked, colour in zip(mark.asked_w, (_X, _Y, _Z), strict=True):
             if asked:
                 axis.plot([mark.start - start, mark.end - start], [1e3 * asked] * 2, color=colour, lw=3, alpha=0.35)
-    axis.legend(loc="center left", ncols=3, fontsize=8, frameon=False)
+    axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=8, frameon=False)
 
 
 def _draw_tip(axis: Axes, flight: Flight, start: float) -> None:
