@@ -70,7 +70,7 @@ def test_an_object_is_picked_up_weighed_carried_and_put_back_twice() -> None:
 
 
 @pytest.mark.scenario
-@pytest.mark.parametrize("world", [500, 4014, 4021])
+@pytest.mark.parametrize("world", [500, 4014])
 def test_a_heavy_object_that_wind_has_it_meet_beside_its_middle_is_put_back(world: int) -> None:
     """Held 3 cm beside that, 297 g and 275 g leaned the vehicle, met their cradles with one end, and were lost."""
     drawn = draw(load("sim_grasp.toml", ("sim.seed=500",)), world)
