@@ -13,6 +13,13 @@ from arm_companion.drivers.calibration_files import TENDONS, TENSION
 from arm_companion.record.topics import FORMAT
 
 _PACKAGES: Final = ("numba", "orjson", "mcap")
+_PROCESSOR: Final = {  # entries of /proc/cpuinfo, on Intel's and AMD's and on Arm's
+    "model name": "",
+    "cpu family": "family ",
+    "model": "model ",
+    "CPU implementer": "implementer ",
+    "CPU part": "part ",
+}
 
 
 def versions(config: Config) -> dict[str, str]:
@@ -45,10 +52,13 @@ def _text(directory: str, name: str) -> str:
 
 
 def _processor() -> str:
-    """Linear algebra picks its code by the processor, and with it the last bits."""
+    """Linear algebra picks its code by the processor, and with it the last bits; a name alone has many generations."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
     except OSError:
         return platform.processor()
-    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "CPU part")))
-    return next(named, platform.processor())
+    lines = (line.partition(":") for line in text.partition("\n\n")[0].splitlines())
+    first = {name.strip(): value.strip() for name, _, value in lines}
+    return (
+        ", ".join(f"{word}{first[name]}" for name, word in _PROCESSOR.items() if name in first) or platform.processor()
+    )

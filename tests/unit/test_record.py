@@ -602,3 +602,22 @@ def test_a_daemon_that_should_record_and_cannot_says_so_at_its_start(monkeypatch
         assert type(configured_recorder(CONFIG, clock)) is Recorder, "none is asked for"
     finally:
         clock._loop.close()
+
+
+@pytest.mark.parametrize(
+    ("cpuinfo", "named"),
+    [
+        (
+            "processor\t: 0\ncpu family\t: 26\nmodel\t\t: 2\nmodel name\t: AMD EPYC\n\nprocessor\t: 1\nmodel\t\t: 9\n",
+            "AMD EPYC, family 26, model 2",
+        ),
+        (
+            "processor\t: 0\nCPU implementer\t: 0x41\nCPU part\t: 0xd0b\n\nRevision\t: d04170\n",
+            "implementer 0x41, part 0xd0b",
+        ),
+    ],
+)
+def test_a_processor_is_named_with_its_generation(monkeypatch: pytest.MonkeyPatch, cpuinfo: str, named: str) -> None:
+    """Two machines called the same rounded differently, and a replay blamed the code."""
+    monkeypatch.setattr(Path, "read_text", lambda *_, **__: cpuinfo)
+    assert versions(Config())["processor"] == named
