@@ -289,7 +289,7 @@ def _reference(s: Situation) -> Reference | None:
         if state.phase is Phase.RELEASE and (state.contact_w is None or s.far(place)):
             return reference.still  # nobody knows where the bar was met
         place = pressing.not_back_down(s, place, reference.position)
-        return Reference(place, _leaving(s, sub(place, reference.position)), state.heading)
+        return Reference(place, (0.0, 0.0, _leaving(s, place[2] - reference.position[2])), state.heading)
     goal, speed = _goal(s)
     # an arm that is wrapped is not turned in by a heading of another place: after a restart nobody knows the bar's
     keeps = state.phase is Phase.UNLOAD and state.anchor is None
@@ -304,14 +304,14 @@ def _reference(s: Situation) -> Reference | None:
     )
 
 
-def _leaving(s: Situation, step: Vec3) -> Vec3:
-    """Velocity of a reference that rises by `step` in this cycle from a bar, as the arm opens, m/s.
+def _leaving(s: Situation, step: float) -> float:
+    """Velocity down of a reference that moves by `step`, m, in this cycle from a bar, as the arm opens, m/s: upwards.
 
     What the bar carried of the arm is the vehicle's again then, which sinks by it, and the mount has 5 mm to spare.
     """
     if not beside.leaves(s) or s.dt <= 0.0:
-        return ZERO
-    return clip_norm((0.0, 0.0, min(step[2], 0.0) / s.dt), s.config.perch.reach_speed_m_per_s)
+        return 0.0
+    return max(min(step, 0.0) / s.dt, -s.config.perch.reach_speed_m_per_s)
 
 
 def _goal(s: Situation) -> tuple[Vec3, float]:

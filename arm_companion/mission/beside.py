@@ -2,13 +2,12 @@
 
 import math
 
-import numpy as np
-
 from arm_companion.mission.estimate import OBSERVER_LAG_S, strength
 from arm_companion.mission.facts import Vec3
 from arm_companion.mission.motion import ZERO, add, dot, rotate, scale, sub
+from arm_companion.mission.parameters import column
 from arm_companion.mission.situation import Situation, at
-from arm_companion.mission.state import PerchKind, Phase
+from arm_companion.mission.state import Phase
 
 _SETTLE_S = 2.5
 _RESTED_S = 0.5
@@ -49,7 +48,7 @@ def curling(s: Situation) -> Vec3:
     state, perch = s.state, s.config.perch
     if s.gripping:  # the straight arm has nothing to curl around
         return s.contact_w
-    share = min(math.hypot(*state.bend) / perch.wrap_bend_rad, 1.0)
+    share = min(_share(s), 1.0)
     closed = add(s.contact_w, scale(s.straight_w, perch.contact_arc_m))
     if state.phase is Phase.RELEASE and state.anchor is not None:
         closed = s.rest
@@ -61,7 +60,7 @@ def curling(s: Situation) -> Vec3:
 
 def leaves(s: Situation) -> bool:
     """Whether an arm below opens, and its vehicle makes away from the bar meanwhile."""
-    return s.state.phase is Phase.RELEASE and not s.grasping and s.state.kind is PerchKind.ANCHOR
+    return s.state.phase is Phase.RELEASE and s.state.perches_below
 
 
 def clear(s: Situation) -> Vec3:
@@ -94,16 +93,15 @@ def aside(s: Situation) -> float:
 
     Wind leans the vehicle, and an arm that is straight points aside with it, by half a centimetre for 1.5 degrees.
     """
-    reach = s.mount.position + s.mount.rotation @ np.array((0.0, 0.0, s.config.perch.contact_arc_m))
-    vehicle = s.facts.vehicle
-    meets = add(vehicle.position_w, rotate(vehicle.attitude_wb, (float(reach[0]), float(reach[1]), float(reach[2]))))
-    x, y, _ = sub(meets, s.bar.point_w)
+    vehicle, (x, y, z) = s.facts.vehicle, s.config.mount.position_m
+    reach = add((x, y, z), scale(column(s.mount.rotation, 2), s.config.perch.contact_arc_m))
+    x, y, _ = sub(add(vehicle.position_w, rotate(vehicle.attitude_wb, reach)), s.bar.point_w)
     return abs(x * s.ahead[1] - y * s.ahead[0])
 
 
 def is_free(s: Situation) -> bool:
     """Whether a curl has yet to reach what it closes around."""
-    return math.hypot(*s.state.bend) < _FREE_SHARE * s.config.perch.wrap_bend_rad
+    return _share(s) < _FREE_SHARE
 
 
 def waits(s: Situation) -> bool:
@@ -111,5 +109,10 @@ def waits(s: Situation) -> bool:
 
     From there on the arm holds the vehicle where it is: what is heavy, and held beside its middle, hangs askew.
     """
-    near = math.hypot(*s.state.bend) >= _WAITS_SHARE * s.config.perch.wrap_bend_rad
-    return s.state.phase is Phase.CLOSE and not s.gripping and near and is_free(s) and aside(s) > _ASIDE_M
+    about_to = s.state.phase is Phase.CLOSE and not s.gripping and _WAITS_SHARE <= _share(s) < _FREE_SHARE
+    return about_to and aside(s) > _ASIDE_M
+
+
+def _share(s: Situation) -> float:
+    """Of the full wrap, to which the arm is told to bend now."""
+    return math.hypot(*s.state.bend) / s.config.perch.wrap_bend_rad

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Quaternion, TendonState, Vec3, VehicleState
-from arm_companion.mission.motion import low_pass_vec, norm, rotate, scale, sub
+from arm_companion.mission.motion import low_pass, low_pass_vec, norm, rotate, scale, sub
 from arm_companion.mission.payload import DRAG_PER_S
 from arm_companion.values import replace
 
@@ -127,9 +127,8 @@ def smooth_tensions(old: tuple[float, ...], tendons: tuple[TendonState, ...], dt
     """Tensions (n,), N, smoothed, taken only while a servo turns: at rest its gears' friction hides them."""
     if len(old) != len(tendons):
         return tuple(tendon.tension for tendon in tendons)
-    share = dt / (_TENSION_SMOOTHING_S + dt)
     return tuple(
-        before + share * (tendon.tension - before) if abs(tendon.speed) > _MOVING_M_PER_S else before
+        low_pass(before, tendon.tension, dt, _TENSION_SMOOTHING_S) if abs(tendon.speed) > _MOVING_M_PER_S else before
         for before, tendon in zip(old, tendons, strict=True)
     )
 

@@ -8,7 +8,7 @@ every straight limit on the place. The acceleration of the mean is the mean of t
 from dataclasses import dataclass
 
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, Reference, add, follow, norm, scale, sub
+from arm_companion.mission.motion import ZERO, Reference, follow, low_pass_vec, norm, scale, sub
 
 _MEAN_S = 0.2
 _THERE_M = 1e-3
@@ -42,19 +42,14 @@ def glide(before: Glide, goal: Vec3, *, speed: float, acceleration: float, dt: f
         return before
     lead = follow(before.lead, goal, 0.0, speed=speed, acceleration=acceleration, yaw_rate=1.0, dt=dt)
     pushed = scale(sub(lead.velocity, before.lead.velocity), 1.0 / dt)
-    share = dt / (_MEAN_S + dt)
     return Glide(
         lead,
-        _mean(before.position, lead.position, share),
-        _mean(before.velocity, lead.velocity, share),
-        _mean(before.acceleration, pushed, share),
+        low_pass_vec(before.position, lead.position, dt, _MEAN_S),
+        low_pass_vec(before.velocity, lead.velocity, dt, _MEAN_S),
+        low_pass_vec(before.acceleration, pushed, dt, _MEAN_S),
     )
 
 
 def there(g: Glide, goal: Vec3) -> bool:
     """Whether it has come to `goal`, but for what the mean still has to go."""
     return g.lead.position == goal and norm(sub(g.position, goal)) <= _THERE_M
-
-
-def _mean(old: Vec3, new: Vec3, share: float) -> Vec3:
-    return add(old, scale(sub(new, old), share))

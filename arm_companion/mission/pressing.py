@@ -10,7 +10,7 @@ from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Vec3
 from arm_companion.mission.motion import add
 from arm_companion.mission.situation import Situation
-from arm_companion.mission.state import PerchKind, Phase
+from arm_companion.mission.state import Phase
 
 EASED_S = 6.0
 """An autopilot that has not let up by then will not."""
@@ -84,7 +84,7 @@ def not_back_down(s: Situation, place: Vec3, before: Vec3) -> Vec3:
 
 
 def _leaves(s: Situation) -> bool:
-    return not s.grasping and s.state.anchor is not None and s.state.kind is PerchKind.ANCHOR
+    return s.state.perches_below and s.state.anchor is not None
 
 
 def _too_much(s: Situation) -> float:

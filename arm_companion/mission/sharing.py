@@ -8,7 +8,7 @@ carries it. docs/adr/0018 says why neither a lowered position nor a disarm is us
 
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission.facts import Vec3
-from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, low_pass_vec, norm, ramp, sub
+from arm_companion.mission.motion import ZERO, Reference, add, dot, follow, low_pass, low_pass_vec, norm, ramp, sub
 from arm_companion.mission.situation import Situation
 from arm_companion.mission.state import Phase, Sharing, State
 from arm_companion.values import replace
@@ -66,8 +66,9 @@ def keep_sharing(s: Situation) -> Sharing:
     """What is known of the load after this cycle."""
     load, vehicle, hang = s.state.sharing, s.facts.vehicle, s.config.hang
     if s.state.phase in _HOVERING and throttle_known(s) and vehicle.armed and not vehicle.landed:
-        share = s.dt / (_HOVER_S + s.dt) if load.hover > 0.0 else 1.0
-        return replace(load, hover=load.hover + share * (vehicle.throttle - load.hover))
+        known = load.hover > 0.0
+        hover = low_pass(load.hover, vehicle.throttle, s.dt, _HOVER_S) if known else vehicle.throttle
+        return replace(load, hover=hover)
     if s.state.phase not in SHARING:
         return replace(load, dropped_s=load.dropped_s + s.dt if _motors_drop(s) else 0.0)
     away = sub(s.state.position, load.place)

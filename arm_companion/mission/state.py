@@ -286,3 +286,8 @@ class State:
     course: Course | None = None  # of the calibration under way
     errors: ArmFault = ArmFault.NONE  # latched until the next READY, PERCH or CALIBRATE
     warned: frozenset[str] = frozenset()  # notices already given in this phase
+
+    @property
+    def perches_below(self) -> bool:
+        """Whether the target is a bar that the vehicle is to fly above, with its arm around it."""
+        return self.task is not Order.GRASP and self.kind is PerchKind.ANCHOR

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from arm_companion.config.schema import LimitsConfig
 from arm_companion.mission.facts import TendonState
+from arm_companion.mission.motion import low_pass
 from arm_companion.values import replace
 
 _SMOOTHING_S = 0.3
@@ -91,9 +92,8 @@ def _watch_one(
 ) -> TendonWatch:
     if not (tendon.torque and tendon.ready and tendon.homed) or tendon.silent or math.isinf(tendon.tension_sigma):
         return _forget(w)
-    share = dt / (_SMOOTHING_S + dt)
-    difference = w.difference + share * (tendon.tension - says.tension - w.difference)
-    bias = max(w.bias + share * (tendon.tension_bias - w.bias), tendon.tension_bias)
+    difference = low_pass(w.difference, tendon.tension - says.tension, dt, _SMOOTHING_S)
+    bias = max(low_pass(w.bias, tendon.tension_bias, dt, _SMOOTHING_S), tendon.tension_bias)
     noise = math.sqrt(max(tendon.tension_sigma**2 - tendon.tension_bias**2, 0.0) * dt / (2.0 * _SMOOTHING_S))
     threshold = limits.tension_disagreement_sigma * math.hypot(bias, noise, says.sigma)
     w = replace(
