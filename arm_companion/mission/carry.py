@@ -8,7 +8,7 @@ from arm_companion.arm.model import Payload
 from arm_companion.arm.reaction import GRAVITY
 from arm_companion.mission import beside, gripper
 from arm_companion.mission.facts import PayloadReport, Vec3
-from arm_companion.mission.grasp import LIGHT_SHARE, low
+from arm_companion.mission.grasp import LIGHT_SHARE, above, lies_down, low
 from arm_companion.mission.motion import ZERO, add, low_pass, low_pass_vec, norm, scale, sub
 from arm_companion.mission.payload import ROTOR_LAG_S, Found, Load, interrupted, watch_load, weigh
 from arm_companion.mission.situation import Situation
@@ -46,7 +46,7 @@ _LOOSE_SHARE = 0.75  # of the tension with which the arm carried; with less it h
 _LOOSE_LIGHT_SHARE = 0.8  # of the load, under which it counts as gone from an arm that is loose
 _GONE_SHARE = 0.35  # the same where it may have met something; less would find a lost one too late
 _PROPPED_SHARE = 0.85  # of the load, under which something else carries part of it; weighing errs by 6 %
-_AGAIN_M = 0.1  # at least
+_AGAIN_M = 0.1  # that a load is lifted off what it met
 _GRIP_S = 1.0
 _GRIP_SIGMA = (0.015, 0.03, 0.015)  # m, base axes: along the bend, along the object's axis, along the arm
 
@@ -186,7 +186,8 @@ def goal(s: Situation) -> tuple[Vec3, float]:
     if s.state.feedforward and s.state.reference is not None and _touching_down(s):
         return s.state.reference.position, grasp.lift_speed_m_per_s
     down, here = s.setting_down, s.facts.vehicle.position_w
-    if norm((down[0] - here[0], down[1] - here[1], 0.0)) > _ABOVE_M and down[2] - here[2] > _NEAR_GROUND_M:
+    # aside of its place it waits in the air; what lies there with one end already, and holds it aside, goes on down
+    if norm((down[0] - here[0], down[1] - here[1], 0.0)) > _ABOVE_M and not lies_down(s):
         return (down[0], down[1], s.state.reference.position[2] if s.state.reference else here[2]), (
             grasp.lift_speed_m_per_s
         )
@@ -276,7 +277,7 @@ def _comes_on(s: Situation) -> bool:
     if s.gripping or not s.state.feedforward or math.isnan(s.state.load.now):
         return False
     since = s.elapsed - _STEADY_S
-    return 0.0 <= since < _COMES_ON_S and s.probe[2] - s.state.position[2] <= _ROSE_M
+    return 0.0 <= since < _COMES_ON_S and above(s) <= _ROSE_M
 
 
 def payload(s: Situation) -> Payload | None:

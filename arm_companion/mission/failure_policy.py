@@ -178,6 +178,12 @@ CAUSES: tuple[Cause, ...] = (
         "does not apply; whoever sets down by hand knows where",
     ),
     Cause(
+        "load swings the vehicle aside as it comes off",
+        ArmFault.NONE,
+        (grasp.hangs_askew,),
+        "not judged: only what is lifted shows by its first swing that it hangs askew",
+    ),
+    Cause(
         "arm closes beside the middle of its object",
         ArmFault.GRIP_TEST_FAILED,
         (grasp.held_aside,),

@@ -17,7 +17,7 @@ from arm_companion.mission.hazards import (
     vehicle_lost,
 )
 from arm_companion.mission.machine import OrderRow, Transition
-from arm_companion.mission.motion import arrived, norm
+from arm_companion.mission.motion import arrived, dot, norm, sub
 from arm_companion.mission.payload import Found
 from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
@@ -32,10 +32,12 @@ LIGHT_SHARE = 0.5
 
 _DROPPED_S = 0.1
 _SET_DOWN_S = 0.4
-_AT_GROUND_M = 0.05
+_AT_GROUND_M = 0.04  # what lay down was off the arm at up to 3 cm, what stood on one end at over 5
 _LOWEST_M = 0.02
 _HELD_ASIDE_M = 0.015
-_EARLY_M = 0.07  # an end that hangs 25 degrees low meets its cradle 5 cm early, and lies down as the arm goes on
+_EARLY_M = 0.07  # an end that hangs 30 degrees low meets its cradle 6 cm early, and lies down as the arm goes on
+_SWUNG_M = 0.045  # up to 13 degrees askew swing the vehicle by 3 cm, 15 and more by over 5
+_SWINGS_S = 2.5
 _PROPPED_S = 0.2
 _RISEN_SHARE = 0.6
 _SETTLE_S = 1.0
@@ -61,7 +63,7 @@ def taken_over_while_setting_down(s: Situation) -> str | None:
 def dropped(s: Situation) -> str | None:
     """The load has left the arm, in the air."""
     load = s.state.load
-    if load.light_s < _DROPPED_S or (s.state.phase is Phase.PLACE and (low(s) or not s.external)):
+    if load.light_s < _DROPPED_S or (s.state.phase is Phase.PLACE and (lies_down(s) or not s.external)):
         return None
     return f"load lost: {load.mass:.2f} kg were carried, {max(load.now, 0.0):.2f} kg are left"
 
@@ -88,6 +90,21 @@ def held_aside(s: Situation) -> str | None:
     if s.gripping or closed(s) is None or (aside := beside.aside(s)) <= _HELD_ASIDE_M:
         return None
     return f"closed {aside * 100:.1f} cm beside the middle"
+
+
+def hangs_askew(s: Situation) -> str | None:
+    """The load has swung the vehicle along its axis as it came off what it lay in: it is held beside its middle.
+
+    It turns the arm, a soft hinge about the vehicle's forward axis, and rolls the vehicle until the flight stack has
+    taken the torque on. Where the middle is told wrong, nothing else shows it.
+    """
+    reference = s.state.reference
+    if s.gripping or reference is None or not s.external or not s.vehicle_fresh or s.elapsed > _SWINGS_S:
+        return None
+    away = sub(s.facts.vehicle.position_w, reference.position)
+    if (swung := abs(dot(away, (-s.ahead[1], s.ahead[0], 0.0)))) < _SWUNG_M:
+        return None
+    return f"the load may hang askew: it swung the vehicle {swung * 100:.1f} cm aside as it came off"
 
 
 def lift_failed(s: Situation) -> str | None:
@@ -119,13 +136,15 @@ def nothing_below(s: Situation) -> str | None:
 def met_early(s: Situation) -> str | None:
     """Something carries part of the load, well above where it was taken: it hangs askew, or not above its place.
 
-    Going on would turn it out of the arm, or push it off what it met. A pilot who sets down by hand knows where.
+    Going on would turn it out of the arm, or push it off what it met. Or something carries all of it, lower, but
+    still above its place: it stands on one end there. A pilot who sets down by hand knows where.
     """
-    load, above = s.state.load, s.probe[2] - s.state.position[2]
-    if not s.external or load.propped_s < _PROPPED_S or above < _EARLY_M:
+    load = s.state.load
+    carried_s = load.light_s if lies_down(s) else load.propped_s
+    if not s.external or low(s) or carried_s < _PROPPED_S:
         return None
     return (
-        f"the load met something {above * 100:.0f} cm above where it was taken: "
+        f"the load met something {above(s) * 100:.0f} cm above where it was taken: "
         f"{load.now:.2f} of {load.mass:.2f} kg are left on the arm"
     )
 
@@ -180,12 +199,22 @@ def set_down(s: Situation) -> str | None:
 
 def risen(s: Situation) -> bool:
     """Whether the vehicle has made most of the test lift."""
-    return s.probe[2] - s.state.position[2] >= _RISEN_SHARE * s.config.grasp.verify_lift_m
+    return above(s) >= _RISEN_SHARE * s.config.grasp.verify_lift_m
+
+
+def above(s: Situation) -> float:
+    """Height of the vehicle over where it took the object, m."""
+    return s.probe[2] - s.state.position[2]
 
 
 def low(s: Situation) -> bool:
     """Whether the vehicle is about as low as where it took the object."""
-    return s.probe[2] - s.state.position[2] < _AT_GROUND_M
+    return above(s) < _AT_GROUND_M
+
+
+def lies_down(s: Situation) -> bool:
+    """Whether the vehicle is so low that an end which hangs low may have met its place, and lies down as it goes on."""
+    return above(s) < _EARLY_M
 
 
 def lowest(s: Situation) -> bool:

@@ -1,6 +1,7 @@
 """What people are told, once in a phase, about a cause that no row of the perch's table answers."""
 
 from arm_companion.mission.facts import ArmFault, Severity
+from arm_companion.mission.grasp import hangs_askew
 from arm_companion.mission.hang import throttle_lost
 from arm_companion.mission.hazards import (
     astray,
@@ -88,6 +89,7 @@ WARNINGS: tuple[Told, ...] = (
     ),
     Told(CARRYING | {Phase.HOLDING}, overstressed, Severity.CRITICAL, "the arm holds"),
     Told(CARRYING, wrench_over_limit, Severity.CRITICAL, "the arm holds"),
+    Told(frozenset({Phase.LIFT}), hangs_askew, Severity.WARNING, "the longer it is carried, the farther it turns"),
     *(
         Told(frozenset({Phase.CARRY}), guard, Severity.WARNING, "the arm holds on, no set-points", error)
         for guard, error in (

@@ -210,6 +210,9 @@ PROVOCATIONS: dict[str, Provocation] = {
     "load meets something high above its place": Provocation(
         "met something", moved((0.0, 0.0, -0.3)), _propped, seconds=0.3
     ),
+    "load swings the vehicle aside as it comes off": Provocation(
+        "hang askew", moved((0.0, 0.06, 0.0)), _remember(since=T0 - 0.5)
+    ),
     "arm closes beside the middle of its object": Provocation(
         "beside the middle",
         lambda facts: moved((0.0, 0.02, 0.0))(tendon(0, tension=30.0)(facts)),

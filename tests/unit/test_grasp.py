@@ -535,6 +535,20 @@ def test_a_load_that_meets_something_high_above_its_place_is_lifted_again_and_ke
     assert not opened(run.said)
 
 
+def test_a_load_that_stands_on_one_end_above_its_place_is_not_taken_for_lost_nor_let_go(
+    parameters: Parameters, hovering: Hovering
+) -> None:
+    """300 g hung 31 degrees askew and jammed 5 cm above where they had lain; an arm that opened dropped them."""
+    run = Run(carrying(Phase.PLACE, up=0.05), parameters)
+    while run.state.phase is Phase.PLACE and len(run.said) < 100:
+        run.cycle(aloft(hovering, 0.1 * MASS, 0.05))
+    assert run.phases == [Phase.PLACE, Phase.LIFT]
+    assert any("met something 5 cm above where it was taken: 0.0" in text for text in run.texts), run.texts
+    run.cycles(aloft(hovering, MASS, 0.15), 1.0)
+    assert run.phases == [Phase.PLACE, Phase.LIFT]
+    assert not opened(run.said)
+
+
 def test_lifted_again_elsewhere_it_stays_there_and_never_goes_down(parameters: Parameters, hovering: Hovering) -> None:
     """A table, two metres away and half a metre higher than what the object lay on."""
     x, y, z = PLACE
@@ -556,6 +570,35 @@ def test_what_touches_near_its_place_or_only_swings_is_set_down(
     run = Run(carrying(Phase.PLACE, up=up), parameters)
     run.cycles(aloft(hovering, share * MASS, up), 1.0)
     assert run.phases == [Phase.PLACE]
+
+
+@pytest.mark.parametrize(("up", "goes_down"), [(0.2, False), (0.06, True)])
+def test_what_is_aside_of_its_place_waits_in_the_air_and_lies_down_once_an_end_of_it_may_lie_there(
+    up: float, goes_down: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    """A load 30 degrees askew met its cradle 6 cm early, and pushed the vehicle aside, which waited, and lost it."""
+    run = Run(carrying(Phase.PLACE, up=up), parameters)
+    run.cycles(moved((0.0, 0.045, 0.0))(aloft(hovering, 0.9 * MASS, up)), 1.5)
+    (_, _, z), _ = asked(run)
+    assert run.phases == [Phase.PLACE]
+    assert (z > PLACE[2] - up + 0.01) is goes_down
+
+
+@pytest.mark.parametrize(
+    ("aside", "ahead", "late", "tells"),
+    [(0.06, 0.0, False, True), (-0.06, 0.0, False, True), (0.03, 0.06, False, False), (0.06, 0.0, True, False)],
+    ids=["to one side", "to the other", "back and forth", "a gust later on"],
+)
+def test_a_load_that_swings_the_vehicle_along_its_axis_as_it_comes_off_is_told_once(
+    aside: float, ahead: float, late: bool, tells: bool, parameters: Parameters, hovering: Hovering
+) -> None:
+    run = Run(carrying(Phase.LIFT, up=0.1, since=T0), parameters)
+    run.cycles(aloft(hovering, MASS, 0.1), 2.6 if late else 0.1)
+    run.cycles(moved((ahead, aside, 0.0))(aloft(hovering, MASS, 0.1)), 0.5)
+    told = [text for text in run.texts if "may hang askew: it swung the vehicle 6.0 cm aside" in text]
+    assert len(told) == (1 if tells else 0), run.texts
+    assert not run.state.errors
+    assert run.phases == [Phase.LIFT]
 
 
 @pytest.mark.parametrize("up", [0.4, 6.0])
