@@ -95,8 +95,12 @@ def aside(s: Situation) -> float:
     """
     vehicle, (x, y, z) = s.facts.vehicle, s.config.mount.position_m
     reach = add((x, y, z), scale(column(s.mount.rotation, 2), s.config.perch.contact_arc_m))
-    x, y, _ = sub(add(vehicle.position_w, rotate(vehicle.attitude_wb, reach)), s.bar.point_w)
-    return abs(x * s.ahead[1] - y * s.ahead[0])
+    return abs(across(s, sub(add(vehicle.position_w, rotate(vehicle.attitude_wb, reach)), s.bar.point_w)))
+
+
+def across(s: Situation, way: Vec3) -> float:
+    """What of a way is level and across the way to bar or object, that is along it; m, signed."""
+    return way[0] * s.ahead[1] - way[1] * s.ahead[0]
 
 
 def is_free(s: Situation) -> bool:

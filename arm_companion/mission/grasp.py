@@ -17,7 +17,7 @@ from arm_companion.mission.hazards import (
     vehicle_lost,
 )
 from arm_companion.mission.machine import OrderRow, Transition
-from arm_companion.mission.motion import arrived, dot, norm, sub
+from arm_companion.mission.motion import arrived, norm, sub
 from arm_companion.mission.payload import Found
 from arm_companion.mission.refusals import cannot_set_out
 from arm_companion.mission.situation import Situation, at
@@ -101,8 +101,7 @@ def hangs_askew(s: Situation) -> str | None:
     reference = s.state.reference
     if s.gripping or reference is None or not s.external or not s.vehicle_fresh or s.elapsed > _SWINGS_S:
         return None
-    away = sub(s.facts.vehicle.position_w, reference.position)
-    if (swung := abs(dot(away, (-s.ahead[1], s.ahead[0], 0.0)))) < _SWUNG_M:
+    if (swung := abs(beside.across(s, sub(s.facts.vehicle.position_w, reference.position)))) < _SWUNG_M:
         return None
     return f"the load may hang askew: it swung the vehicle {swung * 100:.1f} cm aside as it came off"
 

@@ -78,7 +78,7 @@ def test_an_object_is_picked_up_weighed_carried_and_put_back_twice() -> None:
 
 
 @pytest.mark.scenario
-@pytest.mark.parametrize("world", [500, 4014])
+@pytest.mark.parametrize("world", [500, 4014, 4021])
 def test_a_heavy_object_that_wind_has_it_meet_beside_its_middle_is_put_back(world: int) -> None:
     """Held 3 cm beside that, 297 g and 275 g leaned the vehicle, met their cradles with one end, and were lost."""
     result, verdict = fly_drawn(world)
@@ -86,14 +86,8 @@ def test_a_heavy_object_that_wind_has_it_meet_beside_its_middle_is_put_back(worl
     (lift,) = [span for span in result.flight.spans() if span[0] == "LIFT"]
     asked = [(s, place) for s in result.flight.within(*lift[1:]) if (place := result.flight.asked_at(s.t)) is not None]
     assert max(math.dist(s.state.position_w[:2], place[:2]) for s, place in asked) < 0.08
-
-
-@pytest.mark.scenario
-def test_a_load_that_hangs_askew_is_told_and_lies_down_in_its_place() -> None:
-    """297 g held 1.6 cm beside their middle hang 30 degrees askew: one end met its cradle 6 cm early, and jammed."""
-    result, verdict = fly_drawn(4021)
-    assert verdict.success, verdict.reason
-    assert any("may hang askew" in text for _, text in result.flight.texts)
+    if world == 4021:  # 30 degrees askew: one end met its cradle 6 cm early, and jammed
+        assert any("may hang askew" in text for _, text in result.flight.texts)
 
 
 @pytest.mark.scenario
